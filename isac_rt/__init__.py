@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from isac_rt.frame.waveform import Waveform as Waveform
     from isac_rt.propagation.pathset import PathKind as PathKind
     from isac_rt.propagation.pathset import PathSet as PathSet
-    from isac_rt.receive import Detections as Detections
-    from isac_rt.receive import Prediction as Prediction
-    from isac_rt.receive import Reception as Reception
-    from isac_rt.receive import receive_active as receive_active
-    from isac_rt.receive import receive_passive as receive_passive
+    from isac_rt.receive.active import receive_active as receive_active
+    from isac_rt.receive.passive import receive_passive as receive_passive
+    from isac_rt.receive.types import Detections as Detections
+    from isac_rt.receive.types import Prediction as Prediction
+    from isac_rt.receive.types import Reception as Reception
     from isac_rt.results.files import open_results as open_results
     from isac_rt.results.files import save as save
     from isac_rt.results.recorder import Results as Results
@@ -83,7 +83,9 @@ _NAMES = {
     "frame.cube": "IFCube ReceiveArray Reference Transmission",
     "frame.waveform": "Waveform",
     "propagation.pathset": "PathKind PathSet",
-    "receive": "Detections Prediction Reception receive_active receive_passive",
+    "receive.active": "receive_active",
+    "receive.passive": "receive_passive",
+    "receive.types": "Detections Prediction Reception",
     "results.files": "open_results save",
     "results.recorder": "Results",
     "scenario.file": "load to_yaml",

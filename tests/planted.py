@@ -240,7 +240,7 @@ OF_CASES = {
         "power *= 1.03 * abs(back) / np.pi",
     ),
     "numbers of the frame": Bug(
-        "scenario/radio.py",
+        "frame/settings.py",
         "sampling_rate * sampled / (bandwidth - 2 * sampling_rate)",
         "sampling_rate * sampled / bandwidth",
     ),
@@ -468,7 +468,7 @@ OF_CASES = {
         "np.sin(np.pi * (np.arange(size) + 1) / (size + 1)) ** 9",
     ),
     "phase shifters of a cascade": Bug(
-        "scenario/front_end.py", '"errors_std_deg": 2.2}', '"errors_std_deg": 3.2}'
+        "hardware/settings.py", '"errors_std_deg": 2.2}', '"errors_std_deg": 3.2}'
     ),
     "small uav as published": Bug(
         "propagation/rcs.py", '{"small": 3.74, "large": 2.50}', '{"small": 3.47, "large": 2.50}'

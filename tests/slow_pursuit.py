@@ -18,7 +18,7 @@ from isac_rt.receive.estimate import (
 )
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import power_map
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.settings import Receivers
 
 REACH, CYCLES, LEFT_OVER_DB, NEAR = 24, 3, 35.0, (3, 4)
 

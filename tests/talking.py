@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from isac_rt.scenario.environment import Propagation
-from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.frame.settings import Array, Modulation, Noise
+from isac_rt.propagation.settings import Propagation
+from isac_rt.receive.settings import Receivers
+from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 

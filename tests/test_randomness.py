@@ -8,9 +8,10 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from isac_rt.frame.settings import Array, Noise
+from isac_rt.propagation.settings import Propagation
 from isac_rt.randomness import generator, seed_sequence, splitmix64
-from isac_rt.scenario.environment import Propagation
-from isac_rt.scenario.radio import Array, Noise, Radio
+from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import Setup, prepare

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from isac_rt import storage
+from isac_rt.document import ScenarioError
 from isac_rt.runtime import MachineProblem, UserError, of_machine
-from isac_rt.scenario.document import ScenarioError
 from isac_rt.storage import (
     StorageError,
     abandon,

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import Schedule, conventional_schedule
-from isac_rt.receive import Reception
+from isac_rt.receive.types import Reception
 
 
 @dataclass

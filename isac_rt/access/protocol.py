@@ -37,9 +37,9 @@ from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathSet
 from isac_rt.randomness import generator, seed_sequence
-from isac_rt.receive import receive_passive
+from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections
-from isac_rt.scenario.receivers import Receivers
 from isac_rt.signal.if_signal import noisy_if_signal
 from isac_rt.signal.methods import Auto
 from isac_rt.signal.noise import WhiteNoise

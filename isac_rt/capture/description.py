@@ -10,10 +10,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from isac_rt.document import Document
 from isac_rt.frame.antennas import CASCADE_HZ, Antennas, ti_cascade
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
-from isac_rt.scenario.document import Document
-from isac_rt.scenario.node import Node, Problem
+from isac_rt.settings import Node, Problem
 
 Format = Literal["ti_calibration", "dca1000", "numpy", "sigmf"]
 Axis = Literal["frame", "loop", "chirp", "receiver", "sample"]
@@ -125,6 +125,6 @@ def load_description(file: str | Path) -> Description:
 
     Raises
     ------
-    isac_rt.scenario.document.ScenarioError  With one line per problem.
+    isac_rt.document.ScenarioError  With one line per problem.
     """
     return Document(Path(file), "describe the chirp and the frame").check(Description)

@@ -14,7 +14,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
-from isac_rt.propagation import PathKind, make_paths
+from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Exact
 from isac_rt.world.swarm import Pose, attitude

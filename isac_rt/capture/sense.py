@@ -12,11 +12,12 @@ from isac_rt.capture.types import Capture, CaptureError
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
-from isac_rt.receive import Detections, Reception, receive_active
+from isac_rt.receive.active import receive_active
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import describe
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.settings import Receivers
+from isac_rt.receive.types import Detections, Reception
 
 
 def sense(capture: Capture, settings: Receivers) -> Reception:

@@ -177,9 +177,9 @@ def receive(
     import numpy as np
 
     from isac_rt.capture.sense import as_dataset, range_azimuth, sense
+    from isac_rt.document import Document
+    from isac_rt.receive.settings import Receivers
     from isac_rt.results.files import check_folder, write_dataset, write_figure
-    from isac_rt.scenario.document import Document
-    from isac_rt.scenario.receivers import Receivers
     from isac_rt.views.measured import drawn
 
     settings = Receivers()

@@ -14,12 +14,12 @@ import yaml
 
 from isac_rt.cli.siting import Formation, Site, site_of
 from isac_rt.results.files import ResultsError
-from isac_rt.scenario.environment import City
 from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.tree import json_schema
 from isac_rt.storage import write_whole
 from isac_rt.world.city import CityMesh, load_city
 from isac_rt.world.city.place import Place, local_origin, plane_about
+from isac_rt.world.settings import City
 
 SCHEMA = "scenario.schema.json"
 _CANYON = """\

@@ -14,9 +14,9 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from isac_rt.frame.settings import Array, Elements
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.scenario.aspect import AspectTable
-from isac_rt.scenario.radio import Array, Elements
+from isac_rt.settings import AspectTable
 from isac_rt.world.aspect import in_table
 
 PatternModel = Literal["isotropic", "sector", "cosine", "table"]

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.settings import Noise
 from isac_rt.frame.waveform import BOLTZMANN, Waveform
-from isac_rt.scenario.environment import Clutter
-from isac_rt.scenario.radio import Noise
 
 
 def thermal_noise_power(noise: Noise, waveform: Waveform) -> float:
@@ -32,12 +31,6 @@ def noise_power(noise: Noise, waveform: Waveform, reference_amplitude: float) ->
     if noise.model == "snr":
         return reference_amplitude**2 / 10 ** (noise.snr_db / 10)
     return thermal_noise_power(noise, waveform)
-
-
-def noise_rise(clutter: Clutter) -> float:
-    """Power of thermal noise and Gaussian clutter together over the thermal noise's: the sum of two
-    white Gaussian processes is one."""
-    return 1 + 10 ** (clutter.clutter_to_noise_db / 10) if clutter.model == "gaussian" else 1.0
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,9 @@ import numpy as np
 from isac_rt.frame.link import Link
 from isac_rt.frame.payload import Payload, random_payload, unmodulated
 from isac_rt.frame.schedule import Schedule
+from isac_rt.frame.settings import Modulation, RoleChange
 from isac_rt.frame.waveform import Waveform
 from isac_rt.randomness import generator
-from isac_rt.scenario.radio import Modulation
-from isac_rt.scenario.swarm import RoleChange
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from isac_rt.scenario.radio import Array, ChirpTimes, Radio, chirp_times, num_resource_blocks
+from isac_rt.frame.settings import Array, ChirpTimes, Radio, chirp_times, num_resource_blocks
 
 SPEED_OF_LIGHT = 299_792_458.0
 BOLTZMANN = 1.380649e-23

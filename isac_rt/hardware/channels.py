@@ -24,8 +24,8 @@ import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.hardware import settings
 from isac_rt.randomness import generator
-from isac_rt.scenario import front_end as scenario
 
 _MOST_DRIFT = 60 * np.log(10) / 20  # gains that drift for long stop there
 
@@ -104,7 +104,7 @@ def _turned(direction: np.ndarray, tilt: np.ndarray) -> np.ndarray:
     return np.stack([across, c * ahead + s * z, c * z - s * ahead], axis=-1)
 
 
-def coupling_of(o: scenario.Elements, positions: np.ndarray, wavelength: float) -> np.ndarray:
+def coupling_of(o: settings.Elements, positions: np.ndarray, wavelength: float) -> np.ndarray:
     """(L, L) the coupling that a scenario states of elements at positions (L, 3) [m]."""
     out = np.eye(len(positions), dtype=complex)
     if o.coupling:
@@ -121,7 +121,7 @@ def coupling_of(o: scenario.Elements, positions: np.ndarray, wavelength: float) 
 
 
 def elements_of(
-    o: scenario.Elements, positions: np.ndarray, wavelength: float, seed: int, *name: str
+    o: settings.Elements, positions: np.ndarray, wavelength: float, seed: int, *name: str
 ) -> Elements | None:
     """The errors that a scenario states of elements at positions (L, 3) [m]; None where there are
     none. What is drawn depends on the seed and the name alone."""

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isac_rt.scenario import front_end as scenario
+from isac_rt.hardware import settings
 
 _AT_ONE_DB = np.sqrt(10**0.2 - 1)  # power over the saturation's where the gain is 1 dB lower
 
@@ -59,7 +59,7 @@ class Converter:
     headroom: float
 
 
-def converter_of(o: scenario.Converter) -> Converter | None:
+def converter_of(o: settings.Converter) -> Converter | None:
     """The converter that a scenario states; None where it is ideal."""
     if o.ideal:
         return None

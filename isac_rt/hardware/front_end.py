@@ -6,12 +6,12 @@ from dataclasses import dataclass, fields
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
+from isac_rt.hardware import settings
 from isac_rt.hardware.channels import Elements, elements_of
 from isac_rt.hardware.converter import Converter, converter_of, watts
 from isac_rt.hardware.oscillator import Oscillator, oscillator_of
 from isac_rt.hardware.shifter import Shifter, shifter_of
 from isac_rt.hardware.sweep import Ramp, Response, ramp_of, response_of
-from isac_rt.scenario import front_end as scenario
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Ends:
 
 
 def front_end_of(
-    node: scenario.FrontEnd, waveform: Waveform, antennas: Antennas, seed: int, name: str
+    node: settings.FrontEnd, waveform: Waveform, antennas: Antennas, seed: int, name: str
 ) -> FrontEnd:
     """The front end of a terminal that a scenario states."""
     wave = waveform.wavelength

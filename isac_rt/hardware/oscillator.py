@@ -22,10 +22,10 @@ from typing import NamedTuple
 import numpy as np
 import scipy.fft
 
+from isac_rt.hardware import settings
 from isac_rt.kernels.jit import jit
 from isac_rt.kernels.vector import LANES, load, splat, store
 from isac_rt.randomness import generator
-from isac_rt.scenario import front_end as scenario
 
 SLOWEST = 0.1
 """Offset below which nothing is modelled any more [Hz]."""
@@ -338,7 +338,7 @@ def _amplitudes(mask: Mask | None, band: _Band) -> np.ndarray:
     return size.astype(np.float32)
 
 
-def oscillator_of(o: scenario.Oscillator, rate: float, seed: int, name: str) -> Oscillator | None:
+def oscillator_of(o: settings.Oscillator, rate: float, seed: int, name: str) -> Oscillator | None:
     """The oscillator that a scenario states of a terminal; None where it is ideal."""
     if o.ideal:
         return None

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from isac_rt.hardware import settings
 from isac_rt.randomness import generator
-from isac_rt.scenario import front_end as scenario
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Shifter:
         return np.asarray(self.steps[antenna, step])
 
 
-def shifter_of(o: scenario.Shifter, size: int, seed: int, name: str) -> Shifter | None:
+def shifter_of(o: settings.Shifter, size: int, seed: int, name: str) -> Shifter | None:
     """The shifters that a scenario states of so many antennas; None where any phase can be sent."""
     if o.bits is None:
         return None

@@ -22,8 +22,8 @@ from functools import lru_cache
 import numpy as np
 
 from isac_rt.frame.waveform import Waveform
+from isac_rt.hardware import settings
 from isac_rt.randomness import generator
-from isac_rt.scenario import front_end as scenario
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Response:
     slopes : (L,) complex128, of the logarithm from the middle of the chirp to its end
     """
 
-    of: scenario.Response
+    of: settings.Response
     slopes: np.ndarray
 
     @property
@@ -76,7 +76,7 @@ def sampled(response: Response, count: int, before: int = 0) -> np.ndarray:
     return response.at(place).astype(np.complex64)
 
 
-def response_of(o: scenario.Response, size: int, seed: int, *name: str) -> Response | None:
+def response_of(o: settings.Response, size: int, seed: int, *name: str) -> Response | None:
     """The response that a scenario states of so many elements; None where it is flat."""
     if o.ideal:
         return None
@@ -117,7 +117,7 @@ class Ramp:
         return half * (x * x * x) * (self.quadratic / 3 + self.cubic / 4 * x) + wave
 
 
-def ramp_of(o: scenario.Ramp, waveform: Waveform) -> Ramp | None:
+def ramp_of(o: settings.Ramp, waveform: Waveform) -> Ramp | None:
     """The errors that a scenario states; None where there are none."""
     if o.ideal:
         return None

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from isac_rt.frame.waveform import Waveform
+from isac_rt.propagation import settings
 from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.clutter.rayleigh import RayleighClutter
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.model import Propagation
-from isac_rt.scenario import environment
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Swarm
 
 
 def make_propagation(
-    propagation: environment.Propagation,
-    clutter: environment.Clutter,
+    propagation: settings.Propagation,
+    clutter: settings.Clutter,
     swarm: Swarm,
     free: FreeSpace,
     city: CityMesh,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -16,7 +16,7 @@ from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, merge
 from isac_rt.propagation.rcs import CrossSection
 from isac_rt.propagation.ways import LinkState, Ways
-from isac_rt.scenario.swarm import Uav
+from isac_rt.world.settings import Uav
 from isac_rt.world.swarm import Pose
 
 
@@ -42,7 +42,7 @@ class FreeSpace:
     seed : of the cross-sections' fluctuations
     """
 
-    uavs: dict[str, Uav]
+    uavs: Mapping[str, Uav]
     antennas: Antennas
     wavelength: float
     seed: int

@@ -60,8 +60,8 @@ from isac_rt.propagation.legs.legset import LegSet, TracedLegs, leg_set
 from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
+from isac_rt.propagation.settings import Clutter, Propagation
 from isac_rt.propagation.ways import LinkState, Ways
-from isac_rt.scenario.environment import Clutter, Propagation
 from isac_rt.storage import checksum, kept, pack
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.city.scene import shared_scenes

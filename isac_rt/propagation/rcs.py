@@ -7,8 +7,8 @@ import numpy as np
 from scipy.special import i0
 
 from isac_rt.randomness import generator
-from isac_rt.scenario.swarm import Rcs
 from isac_rt.world.aspect import in_table
+from isac_rt.world.settings import Rcs
 
 SMALL_MEAN_DBSM = -12.81  # TR 38.901 v19 table 7.9.2.1-1
 TR38901_STD_DB = {"small": 3.74, "large": 2.50}

@@ -14,9 +14,9 @@ from isac_rt.receive.clutter.filter import ClutterFilter
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Detector, look_at, make_maps
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import cleaned
 from isac_rt.receive.types import ExpectedClutter, Gates, Reception
-from isac_rt.scenario.receivers import Receivers
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from scipy import optimize, special
 
 from isac_rt.kernels.jit import jit
 from isac_rt.kernels.order import median
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.settings import Receivers
 
 HANN_CORRELATION = ((2 / 3) ** 2, (1 / 6) ** 2)
 """Correlation of the powers of cells one and two apart along a Hann-windowed axis."""

@@ -20,11 +20,11 @@ from isac_rt.receive.maps import Conventional, LatinUnion
 from isac_rt.receive.omp import Omp
 from isac_rt.receive.pursuit import BySchedule, Pursuit
 from isac_rt.receive.sense import Cfar, Detector
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.symbols.beams import ByBeams
 from isac_rt.receive.symbols.powers import ByPowers
 from isac_rt.receive.symbols.profile import ByProfile
 from isac_rt.receive.types import Detections
-from isac_rt.scenario.receivers import Receivers
 
 Refiner = Callable[[Moments, Detections], tuple[Detections, np.ndarray]]
 """From the sums of samples and near estimates to better ones and the paths' powers."""

@@ -17,6 +17,7 @@ from isac_rt.receive.joint.neighbours import separate
 from isac_rt.receive.joint.tones import JointPath
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Cfar, Sensed, describe, look_at, make_maps
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import cleaned
 from isac_rt.receive.symbols.blind import Peaks, find_peaks, read_peaks
 from isac_rt.receive.symbols.phases import decide_phases
@@ -37,7 +38,6 @@ from isac_rt.receive.types import (
     Reception,
     no_detections,
 )
-from isac_rt.scenario.receivers import Receivers
 
 REFERENCE_SPAN_DB = 20.0
 """The line of sight arrives first; what precedes the strongest path by more is a sidelobe or

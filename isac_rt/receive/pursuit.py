@@ -36,8 +36,8 @@ from isac_rt.receive.maps import (
 )
 from isac_rt.receive.omp import Omp, sparse_enough
 from isac_rt.receive.sense import Cfar, Sensed, describe, doppler_of, window_gain
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import ExpectedClutter
-from isac_rt.scenario.receivers import Receivers
 
 FARTHEST_REACH = 24
 """Range rows on each side in which the strongest paths are taken out; Hann's lobes are 90 dB down

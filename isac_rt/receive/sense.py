@@ -32,8 +32,8 @@ from isac_rt.receive.maps import (
     slow_window,
 )
 from isac_rt.receive.omp import Omp, advise
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Look, Maps, Neighbours
-from isac_rt.scenario.receivers import Receivers
 
 MIXED = 0.1
 """Power of other paths over its own from which a detection starts no track, beside what noise

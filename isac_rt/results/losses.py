@@ -16,8 +16,8 @@ from isac_rt.kernels.jit import jit
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.receive.cfar import STRONG, CfarRule, lobe_bound
 from isac_rt.receive.maps import UNION_FLOOR
+from isac_rt.receive.settings import Receivers
 from isac_rt.results.labels import Places, cells_apart, hann_response
-from isac_rt.scenario.receivers import Receivers
 
 MATCHED_DB = 13.0
 """SNR under which a coherent matched filter is taken to see nothing: with 13.1 dB it finds a steady

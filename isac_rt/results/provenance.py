@@ -12,7 +12,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from isac_rt.scenario.file import ScenarioWarning, to_yaml
+from isac_rt.document import ScenarioWarning
+from isac_rt.scenario.file import to_yaml
 from isac_rt.scenario.tree import Scenario
 from isac_rt.storage import program_fingerprint, versions
 from isac_rt.world.area import city_digest, file_digest

@@ -16,9 +16,9 @@ from isac_rt.frame.antennas import Antennas, azimuth_elevation, resolutions
 from isac_rt.frame.cube import Transmission
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
-from isac_rt.propagation import PathKind, PathSet
-from isac_rt.receive import Reception
-from isac_rt.receive.types import Detections
+from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.receive.settings import Receivers
+from isac_rt.receive.types import Detections, Reception
 from isac_rt.results.bounds import CramerRao
 from isac_rt.results.labels import Aim, Places, explain, owners
 from isac_rt.results.losses import MATCHED_DB, Chance, Sensitivity, cause_of
@@ -32,7 +32,6 @@ from isac_rt.results.metrics import (
     within_view,
 )
 from isac_rt.results.records import LateRecord, ObserverRecord, TrackTable, UavValues
-from isac_rt.scenario.receivers import Receivers
 from isac_rt.terminal.retrospect import Late
 from isac_rt.terminal.tracker import TrackSet
 from isac_rt.world.swarm import Swarm

@@ -1,18 +1,16 @@
 """The whole input of a run as a frozen, typed tree; `isac_rt.scenario.file` reads and writes it."""
 
-from isac_rt.scenario.environment import (
-    Accuracy,
-    City,
-    Clutter,
-    Leakage,
-    MaterialOverride,
-    Propagation,
-)
-from isac_rt.scenario.front_end import FrontEnd
-from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
-from isac_rt.scenario.receivers import Receivers, Tracking
-from isac_rt.scenario.swarm import Access, Rcs, RoleChange, Uav, Waypoint
+from isac_rt.access.settings import Access
+from isac_rt.frame.settings import Array, Modulation, Noise, RoleChange
+from isac_rt.hardware.settings import FrontEnd
+from isac_rt.propagation.settings import Clutter, Leakage, Propagation
+from isac_rt.receive.settings import Receivers
+from isac_rt.scenario.radio import Radio
+from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
+from isac_rt.signal.settings import Accuracy
+from isac_rt.terminal.settings import Tracking
+from isac_rt.world.settings import City, MaterialOverride, Rcs, Waypoint
 
 __all__ = [
     "Access",

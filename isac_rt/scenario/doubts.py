@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from itertools import combinations, pairwise
 from statistics import median
 
-from isac_rt.scenario.node import Key, Problem
 from isac_rt.scenario.tree import Scenario
+from isac_rt.settings import Key, Problem
 
 PLAUSIBLE: dict[Key, tuple[float, float, str]] = {
     ("radio", "carrier_hz"): (1e9, 1e12, "hertz"),

@@ -11,16 +11,11 @@ from typing import Any
 
 import yaml
 
-from isac_rt.scenario.document import TAG, Document, Loader, ScenarioError
+from isac_rt.document import TAG, Document, Loader, ScenarioError, ScenarioWarning
 from isac_rt.scenario.doubts import doubts
-from isac_rt.scenario.node import Node, Problem
-from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.scenario.tables import TableError, with_tables
 from isac_rt.scenario.tree import Scenario
-
-
-class ScenarioWarning(UserWarning):
-    """The scenario can be used, but a value looks as if it were in another unit."""
+from isac_rt.settings import Problem, plain_tree
 
 
 def load(
@@ -45,7 +40,7 @@ def load(
     Raises
     ------
     ScenarioError
-        With one line per problem, at most `isac_rt.scenario.document.MAX_MESSAGES`.
+        With one line per problem, at most `isac_rt.document.MAX_MESSAGES`.
 
     Warns
     -----
@@ -90,23 +85,6 @@ def load(
     for doubt in doubts(scenario):
         warnings.warn(document.complaint(doubt), ScenarioWarning, stacklevel=2)
     return scenario
-
-
-def plain_tree(value: Any) -> Any:
-    """A tree as lists, mappings and numbers, without the keys that have no meaning beside the
-    others. A null that is no more than its default is left out, but where a preset would fill it
-    in."""
-    if isinstance(value, Node):
-        fields, by_preset = type(value).model_fields, isinstance(value, Receivers | Tracking)
-        return {
-            name: plain_tree(item)
-            for name, item in value
-            if value.applies(name)
-            and (by_preset or item is not None or fields[name].default is not None)
-        }
-    if isinstance(value, dict):
-        return {name: plain_tree(item) for name, item in value.items()}
-    return [plain_tree(item) for item in value] if isinstance(value, tuple) else value
 
 
 def folded_tree(scenario: Scenario, keys: Iterable[str]) -> dict[str, Any]:

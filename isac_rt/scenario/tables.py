@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from isac_rt.scenario.node import Key
+from isac_rt.settings import Key
 
 MAX_BYTES = 4_000_000
 MAX_ROWS = 20_000

@@ -24,13 +24,19 @@ from pydantic import (
     model_validator,
 )
 
-from isac_rt.scenario.environment import Accuracy, Belief, City, Clutter, Propagation
-from isac_rt.scenario.front_end import Elements, FrontEnd, Response
-from isac_rt.scenario.node import Key, Name, Node, Positive, Problem, Seed, dotted
-from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
-from isac_rt.scenario.receivers import Preset, Receivers, ReceiverSet, Tracking, with_preset
+from isac_rt.access.settings import Access
+from isac_rt.frame.settings import Array, Modulation, Noise, RoleChange
+from isac_rt.hardware.settings import Elements, FrontEnd, Response
+from isac_rt.propagation.settings import Clutter, Propagation
+from isac_rt.receive.settings import Receivers
+from isac_rt.scenario.presets import Preset, ReceiverSet, with_preset
+from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.sensors import Sensor, with_sensor
-from isac_rt.scenario.swarm import Access, Formation, RoleChange, Uav, formations, unfolded
+from isac_rt.scenario.swarm import Uav, formations, unfolded
+from isac_rt.settings import Key, Name, Node, Positive, Problem, Seed, dotted
+from isac_rt.signal.settings import Accuracy
+from isac_rt.terminal.settings import Belief, Tracking
+from isac_rt.world.settings import City, Formation
 
 OWN = "own"
 """Name of the scenario's own receivers beside those compared with them."""

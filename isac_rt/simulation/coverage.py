@@ -21,7 +21,7 @@ from isac_rt.frame.schedule import unambiguous_share
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.receive.cfar import first_row
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.settings import Receivers
 from isac_rt.world.swarm import Swarm
 
 MOST_FRAMES = 1_000

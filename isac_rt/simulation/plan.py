@@ -44,11 +44,12 @@ from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.cells import Density, error_for
 from isac_rt.propagation.model import Census
 from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.propagation.settings import Clutter, Propagation
 from isac_rt.results.records import Use
-from isac_rt.scenario.environment import Accuracy, Clutter, Propagation
 from isac_rt.signal.choice import CostModel
 from isac_rt.signal.gridded import GRIDDED_ERROR
 from isac_rt.signal.methods import Auto, Direct, Gridded, Method
+from isac_rt.signal.settings import Accuracy
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Swarm
 

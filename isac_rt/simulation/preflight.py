@@ -9,14 +9,13 @@ import warnings
 
 import numpy as np
 
+from isac_rt.document import ScenarioError, ScenarioWarning
 from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.settings import Noise
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform
+from isac_rt.propagation.settings import Clutter
 from isac_rt.runtime import available_memory
-from isac_rt.scenario.document import ScenarioError
-from isac_rt.scenario.environment import Clutter
-from isac_rt.scenario.file import ScenarioWarning
-from isac_rt.scenario.radio import Noise
 from isac_rt.scenario.tree import NEAREST_M
 from isac_rt.simulation.coverage import Coverage, Outside, unambiguous_velocity
 from isac_rt.world.city.mesh import CityMesh

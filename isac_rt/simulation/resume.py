@@ -18,8 +18,8 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from isac_rt.document import ScenarioWarning
 from isac_rt.runtime import UserError, shortly
-from isac_rt.scenario.file import ScenarioWarning
 from isac_rt.storage import BAD_DATA, checksum, pack, unpack
 
 FILE = "resume.sqlite"

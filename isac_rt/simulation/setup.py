@@ -10,15 +10,16 @@ from functools import cached_property, partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from isac_rt.access import Clock, Connections, Network, establish
+from isac_rt.access.connect import Connections
+from isac_rt.access.protocol import Clock, Network, establish
 from isac_rt.capture.calibrate import Calibration, ideal, load_calibration
+from isac_rt.document import ScenarioError
 from isac_rt.frame.antennas import Antennas, antennas_of
 from isac_rt.frame.cube import IFCube, RangeProfiles, ReceiveArray, Reference, Transmission
 from isac_rt.frame.level import (
     LinkBudget,
     link_budget,
     noise_power,
-    noise_rise,
     thermal_noise_power,
     transmit_amplitude,
 )
@@ -27,15 +28,16 @@ from isac_rt.frame.schedule import Schedule, codes_of, schedule_of
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform, waveform_of
 from isac_rt.hardware.front_end import Ends, FrontEnd, front_end_of
-from isac_rt.propagation import FreeSpace, PathSet, Propagation, Traced, make_propagation
+from isac_rt.propagation.build import make_propagation
 from isac_rt.propagation.clutter.merging import NoiseFloor
+from isac_rt.propagation.free_space import FreeSpace
+from isac_rt.propagation.model import Propagation, Traced
+from isac_rt.propagation.pathset import PathSet
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.results.provenance import path_content
 from isac_rt.results.records import Use
-from isac_rt.scenario.document import ScenarioError
-from isac_rt.scenario.environment import Belief
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.choice import SHIPPED
 from isac_rt.signal.choice import read as read_costs
@@ -55,6 +57,7 @@ from isac_rt.simulation.preflight import (
 from isac_rt.simulation.stopwatch import NONE, Seconds
 from isac_rt.terminal.expectation import ClutterExpectation, Mistakes, make_expectation
 from isac_rt.terminal.ghosts import Walls
+from isac_rt.terminal.settings import Belief
 from isac_rt.world.area import city_about, city_digest
 from isac_rt.world.city import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
@@ -506,7 +509,7 @@ def _noise_power(
     poses: dict[str, Pose],
     link: Link,
 ) -> float:
-    noise, rise = scenario.noise, noise_rise(scenario.clutter)
+    noise, rise = scenario.noise, scenario.clutter.noise_rise
     if noise.model == "link_budget":
         return rise * thermal_noise_power(noise, waveform)
     amplitude = reference.reference_amplitude(poses, link)

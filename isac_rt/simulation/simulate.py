@@ -18,17 +18,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from isac_rt.access import exchange
 from isac_rt.access.fall_back import Schedules
+from isac_rt.access.feedback import exchange
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.link import Link
+from isac_rt.receive.settings import Receivers
 from isac_rt.results.provenance import provenance
 from isac_rt.results.recorder import Figures, Recorder, Results
 from isac_rt.results.records import FrameRecord, LateRecord, ObserverRecord, PictureRecord
 from isac_rt.results.scoring import Heard, Scorer
 from isac_rt.results.swarm import SwarmScorer
 from isac_rt.runtime import tracing_in_one_thread
-from isac_rt.scenario.receivers import Receivers, ReceiverSet
+from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.scenario.tree import OWN, Scenario
 from isac_rt.simulation.cooperation import AHEAD, Cooperation
 from isac_rt.simulation.plan import decisions, extent, mechanisms

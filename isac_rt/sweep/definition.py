@@ -18,20 +18,20 @@ from typing import Annotated, Any, Protocol
 import numpy as np
 from pydantic import Field, ValidationError, field_validator
 
+from isac_rt.document import Document, ScenarioError
 from isac_rt.randomness import seed_sequence
 from isac_rt.results.metrics import SymbolCount
 from isac_rt.results.provenance import path_content
 from isac_rt.results.sensing import RATES, Sensing, summary_block
-from isac_rt.scenario.document import Document, ScenarioError
-from isac_rt.scenario.environment import City
 from isac_rt.scenario.file import folded_tree, load
-from isac_rt.scenario.node import Key, Name, Node, Problem, Seed, dotted
 from isac_rt.scenario.swarm import unfolded
 from isac_rt.scenario.tables import with_tables
 from isac_rt.scenario.tree import Scenario
+from isac_rt.settings import Key, Name, Node, Problem, Seed, dotted
 from isac_rt.storage import program_fingerprint, versions
 from isac_rt.world.area import city_digest, file_digest
 from isac_rt.world.city import CityError
+from isac_rt.world.settings import City
 
 MAX_POINTS = 100_000
 """More points than this are taken for a slip unless asked for."""

@@ -16,15 +16,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError
 
+from isac_rt.document import Document, ScenarioError
 from isac_rt.frame.schedule import decoded_schedule
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.randomness import generator, seed_sequence
-from isac_rt.scenario.document import Document, ScenarioError
 from isac_rt.scenario.file import folded_tree, load
-from isac_rt.scenario.node import Key, Name, Problem, Seed, dotted
 from isac_rt.scenario.swarm import unfolded
 from isac_rt.scenario.tree import Scenario
+from isac_rt.settings import Key, Name, Problem, Seed, dotted
 from isac_rt.simulation.preflight import check_passage
 from isac_rt.simulation.setup import city_of, swarm_of, timetable_of
 from isac_rt.sweep.definition import (

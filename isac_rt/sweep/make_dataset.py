@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from isac_rt.results.provenance import commit
-from isac_rt.scenario.file import plain_tree
+from isac_rt.settings import plain_tree
 from isac_rt.storage import program_fingerprint, versions, write_whole
 from isac_rt.sweep.definition import Point
 from isac_rt.sweep.drawn import DataPlan

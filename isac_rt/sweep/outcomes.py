@@ -22,8 +22,8 @@ from isac_rt.results.files import ResultsError, read_dataset, write_dataset
 from isac_rt.results.metrics import binomial_interval
 from isac_rt.results.provenance import commit
 from isac_rt.runtime import shortly
-from isac_rt.scenario.file import plain_tree
 from isac_rt.scenario.tree import Scenario
+from isac_rt.settings import plain_tree
 from isac_rt.storage import (
     BAD_DATA,
     checksum,

@@ -21,10 +21,10 @@ from isac_rt.propagation.clutter.cells import Density
 from isac_rt.propagation.clutter.field import ClutterField, Seen
 from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.clutter.two_bounces import SeenByMirror, TwoBounces
+from isac_rt.propagation.settings import Clutter
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
-from isac_rt.scenario.environment import Clutter
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
 

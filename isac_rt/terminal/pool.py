@@ -17,7 +17,6 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from isac_rt.scenario.receivers import Tracking
 from isac_rt.terminal.filter import (
     STD_FLOOR,
     Ambiguity,
@@ -45,6 +44,7 @@ from isac_rt.terminal.fusion import (
     in_datum,
     recognise,
 )
+from isac_rt.terminal.settings import Tracking
 from isac_rt.terminal.tracker import ROUNDING, assign
 from isac_rt.world.swarm import Pose
 

@@ -16,10 +16,9 @@ import numpy as np
 
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Reception
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.symbols.blind import DataPath, Peaks, acquire
-from isac_rt.receive.types import Detections, ExpectedClutter
+from isac_rt.receive.types import Detections, ExpectedClutter, Reception
 
 BATCH = 8
 """Frames kept at most."""

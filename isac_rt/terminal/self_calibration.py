@@ -30,8 +30,8 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.modes import MODES, polynomials
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Look, Neighbours
-from isac_rt.scenario.receivers import Receivers
 
 GAIN_STD = 0.2, 0.6
 """Before the first look: logarithm of an element's amplitude (1.7 dB) and phase [rad] (34

@@ -20,12 +20,18 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive import Prediction, Reception
 from isac_rt.receive.active import ActiveReceiver
 from isac_rt.receive.passive import PassiveReceiver
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.symbols.powers import EXTRA_CELLS
-from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Gates
-from isac_rt.scenario.receivers import Receivers, Tracking
+from isac_rt.receive.types import (
+    Correction,
+    Detections,
+    ExpectedClutter,
+    Gates,
+    Prediction,
+    Reception,
+)
 from isac_rt.terminal.filter import (
     Ambiguity,
     Gaussian,
@@ -43,6 +49,7 @@ from isac_rt.terminal.ghosts import Walls
 from isac_rt.terminal.images import WELL_INSIDE, Doubts, sender_images
 from isac_rt.terminal.retrospect import COAST_CELLS, Late, Retrospect
 from isac_rt.terminal.self_calibration import calibration_of
+from isac_rt.terminal.settings import Tracking
 from isac_rt.terminal.sights import echoes, lines_of_sight, seen_after
 from isac_rt.terminal.standing import Standing, rests
 from isac_rt.terminal.tracker import Track, Tracker, TrackSet, in_plane

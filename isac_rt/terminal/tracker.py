@@ -15,7 +15,6 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from isac_rt.receive.types import Detections, Prediction
-from isac_rt.scenario.receivers import Tracking
 from isac_rt.terminal.filter import (
     Ambiguity,
     Gaussian,
@@ -28,6 +27,7 @@ from isac_rt.terminal.filter import (
     reported,
     update,
 )
+from isac_rt.terminal.settings import Tracking
 from isac_rt.world.swarm import Pose
 
 SURE_HITS = 2

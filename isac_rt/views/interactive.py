@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from isac_rt.frame.link import Link
-from isac_rt.propagation import PathKind, PathSet
+from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.storage import write_whole
 from isac_rt.views.figures import KIND_COLOURS, colour_of, words
 from isac_rt.views.moving_scene import ROLE_SYMBOLS, city_traces, layout

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.scenario import environment
-from isac_rt.scenario.file import plain_tree
+from isac_rt.settings import plain_tree
 from isac_rt.storage import kept
+from isac_rt.world import settings
 from isac_rt.world.city import CityMesh, city_files, load_city
 
 _LOG = logging.getLogger(__name__)
@@ -21,7 +21,7 @@ _LOG = logging.getLogger(__name__)
 
 def city_about(
     centre: np.ndarray,
-    city: environment.City | None,
+    city: settings.City | None,
     folder: Path,
     carrier: float,
     radius: float = np.inf,
@@ -50,7 +50,7 @@ def _near_city(radius: float, *of: Any) -> CityMesh:
 def _loaded_city(
     text: str, folder: Path, digest: str, carrier: float, centre: tuple[float, ...]
 ) -> CityMesh:
-    tree = environment.City.model_validate(json.loads(text)) if text else None
+    tree = settings.City.model_validate(json.loads(text)) if text else None
     if tree is not None:
         _LOG.info("reading the city")
     if not digest:  # made from numbers, in less time than it is read
@@ -64,7 +64,7 @@ def _loaded_city(
     )
 
 
-def city_digest(city: environment.City | None, folder: Path) -> str:
+def city_digest(city: settings.City | None, folder: Path) -> str:
     """SHA-256 of every file that the city is read from, "" without one.
 
     Raises

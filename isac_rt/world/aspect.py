@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from isac_rt.scenario.aspect import AspectTable
+from isac_rt.settings import AspectTable
 
 
 @lru_cache(maxsize=32)

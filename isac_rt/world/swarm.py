@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline, PPoly
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from isac_rt.scenario.swarm import Uav
+from isac_rt.world.settings import Uav
 
 SAG_M = 0.01
 MOST_PLACES = 20_000
@@ -186,7 +186,7 @@ class Swarm:
     ([0.0, 7.5, 30.0], [0.0, 5.0, 30.0])
     """
 
-    uavs: dict[str, Uav]
+    uavs: Mapping[str, Uav]
     duration: float = 0.0
     successors: tuple[str, ...] = ()
 

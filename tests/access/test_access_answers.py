@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from isac_rt.access import Clock, ClockEstimate, Connections, Establishment, LinkState
+from isac_rt.access.connect import Connections
 from isac_rt.access.fall_back import Schedules
 from isac_rt.access.feedback import correct, echo_of, exchange, frames_to_repair, summarise
-from isac_rt.access.synchronise import EXTERNAL, round_of
+from isac_rt.access.protocol import Clock, Establishment, LinkState
+from isac_rt.access.synchronise import EXTERNAL, ClockEstimate, round_of
 from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Reception
-from isac_rt.receive.types import Detections, no_detections
+from isac_rt.receive.types import Detections, Reception, no_detections
 from isac_rt.terminal.filter import Gaussian
 from isac_rt.terminal.tracker import Track, TrackSet, track_set
 from isac_rt.world.swarm import Pose

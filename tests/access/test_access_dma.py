@@ -13,8 +13,9 @@ from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
-from isac_rt.receive import Prediction, receive_passive
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.settings import Receivers
+from isac_rt.receive.types import Prediction
 from isac_rt.signal.exact import filter_gain
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Direct, Exact

@@ -14,8 +14,9 @@ from isac_rt.access.feedback import Feedback, correct, frames_to_repair, summari
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Prediction, receive_passive
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.settings import Receivers
+from isac_rt.receive.types import Prediction
 
 W = Waveform(num_samples=256, num_chirps=60)
 FEW = replace(ANTENNAS, rx_x=2, rx_z=2, spacing=0.5774 * W.wavelength)

@@ -15,7 +15,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.settings import Receivers
 from isac_rt.world.swarm import Pose
 
 C = SPEED_OF_LIGHT

@@ -19,9 +19,8 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Reception
-from isac_rt.receive.types import Detections, no_detections
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.settings import Receivers
+from isac_rt.receive.types import Detections, Reception, no_detections
 from isac_rt.world.swarm import Pose
 
 C = 299_792_458.0

@@ -14,8 +14,8 @@ from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.randomness import seed_sequence
-from isac_rt.receive import receive_passive
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.settings import Receivers
 from isac_rt.signal.if_signal import add_noise, if_signal
 from isac_rt.world.swarm import Pose
 

@@ -19,11 +19,11 @@ from isac_rt.access.messages import (
     Notes,
     Sightings,
 )
-from isac_rt.scenario.receivers import Tracking
 from isac_rt.storage import pack, unpack
 from isac_rt.terminal.filter import Ambiguity, Gaussian
 from isac_rt.terminal.fusion import DATUM_STD, ERRORS, Key, Told
 from isac_rt.terminal.pool import Lives, Look, PooledTracker
+from isac_rt.terminal.settings import Tracking
 from isac_rt.world.swarm import Pose
 
 T = 0.05

@@ -22,8 +22,8 @@ from isac_rt.capture.readers import import_file
 from isac_rt.capture.store import load_capture, save_capture
 from isac_rt.capture.types import CaptureError
 from isac_rt.cli.cli import main
+from isac_rt.document import ScenarioError
 from isac_rt.results.files import ResultsError
-from isac_rt.scenario.document import ScenarioError
 
 FRAMES, LOOPS, CHIRPS, RX, SIZE = 2, 3, (0, 2, 1), 4, 16
 COMMON = {

@@ -12,7 +12,7 @@ from isac_rt.capture.readers import import_file
 from isac_rt.capture.sense import range_azimuth, sense
 from isac_rt.capture.types import CaptureError
 from isac_rt.cli.cli import main
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.settings import Receivers
 
 RATE, SLOPE, SIZE, LOOPS, AGAIN = 5e6, 40e12, 64, 16, 60e-6
 ELEMENTS = {

@@ -23,8 +23,9 @@ from matplotlib.image import imread
 import isac_rt.simulation
 from isac_rt.cli import console
 from isac_rt.cli.cli import main
+from isac_rt.document import ScenarioWarning
 from isac_rt.frame.level import LinkBudget
-from isac_rt.scenario.file import ScenarioWarning, to_yaml
+from isac_rt.scenario.file import to_yaml
 from isac_rt.simulation.setup import swarm_of
 
 ROOT = Path(__file__).parents[2]

@@ -14,8 +14,8 @@ from scipy.integrate import dblquad
 
 from isac_rt.frame.antennas import Antennas, l_shape
 from isac_rt.frame.schedule import conventional_schedule, is_latin, pseudo_random_schedule
+from isac_rt.frame.settings import Array
 from isac_rt.scenario.file import load
-from isac_rt.scenario.radio import Array
 from isac_rt.simulation.setup import prepare
 
 SCENES = Path(__file__).parents[2] / "scenes"

@@ -7,8 +7,8 @@ import pytest
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.level import link_budget, noise_power, thermal_noise_power, transmit_amplitude
+from isac_rt.frame.settings import Noise
 from isac_rt.frame.waveform import Waveform
-from isac_rt.scenario.radio import Noise
 
 WAVEFORM = Waveform()
 PUBLISHED = 0.005  # decibel figures given to two decimals

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import yaml
 
+from isac_rt.document import ScenarioError
 from isac_rt.frame.schedule import codes_of, images, schedule_of, unambiguous_share
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Sweep, Waveform, waveform_of
-from isac_rt.scenario.document import ScenarioError
 from isac_rt.scenario.file import load, to_yaml
 
 CHIRP = {"slope_mhz_per_us": 21.0, "idle_us": 4, "adc_start_us": 3.5, "ramp_end_us": 31}

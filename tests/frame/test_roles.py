@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.scenario.environment import Propagation
-from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
-from isac_rt.scenario.receivers import Receivers
-from isac_rt.scenario.swarm import RoleChange, Uav
+from isac_rt.frame.settings import Array, Modulation, Noise, RoleChange
+from isac_rt.propagation.settings import Propagation
+from isac_rt.receive.settings import Receivers
+from isac_rt.scenario.radio import Radio
+from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare

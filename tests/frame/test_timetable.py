@@ -7,15 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from isac_rt.document import ScenarioWarning
 from isac_rt.frame.link import Link
 from isac_rt.frame.payload import demodulate_bits, random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
+from isac_rt.frame.settings import Modulation, RoleChange
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform, waveform_of
-from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
-from isac_rt.scenario.radio import Modulation, Radio
-from isac_rt.scenario.receivers import Receivers
-from isac_rt.scenario.swarm import RoleChange, Uav
+from isac_rt.receive.settings import Receivers
+from isac_rt.scenario.file import load, to_yaml
+from isac_rt.scenario.radio import Radio
+from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import timetable_of
 

@@ -10,12 +10,13 @@ from itertools import product
 import numpy as np
 import pytest
 
+from isac_rt.document import ScenarioWarning
 from isac_rt.frame.antennas import Antennas, antennas_of, azimuth_elevation, unit_vector
+from isac_rt.frame.settings import Array
 from isac_rt.frame.waveform import Waveform
+from isac_rt.propagation.settings import Propagation
 from isac_rt.results.metrics import within_view
-from isac_rt.scenario.environment import Propagation
-from isac_rt.scenario.file import ScenarioWarning
-from isac_rt.scenario.radio import Array, Radio
+from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import prepare

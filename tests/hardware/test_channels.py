@@ -7,7 +7,7 @@ import pytest
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.hardware.channels import elements_of
-from isac_rt.scenario.front_end import Elements
+from isac_rt.hardware.settings import Elements
 
 C = 299_792_458.0
 WAVE = C / 77e9

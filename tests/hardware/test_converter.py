@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isac_rt.hardware.converter import converter_of, saturated, watts
-from isac_rt.scenario.front_end import Converter
+from isac_rt.hardware.settings import Converter
 from isac_rt.signal.chain import NO_ROWS, NO_TURNS, Work, finish
 
 TURNS = (5**0.5 - 1) / 10  # no sine that comes round soon

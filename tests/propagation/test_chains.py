@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from isac_rt import scenario
-from isac_rt.propagation import PathKind, PathSet
+from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import CityMesh, Material, load_city
 

@@ -13,7 +13,7 @@ from scipy.ndimage import uniform_filter
 
 from isac_rt import scenario
 from isac_rt.frame.link import Link
-from isac_rt.propagation import PathKind
+from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import CityMesh, load_city

@@ -20,10 +20,10 @@ from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation import PathKind
 from isac_rt.propagation.clutter import cells as clutter_cells
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.clutter.resampled import scatterer_phase
+from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import seed_sequence
 from isac_rt.receive.clutter.coherent import Bucketed, searches

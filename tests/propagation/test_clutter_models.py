@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from isac_rt.document import ScenarioError
 from isac_rt.frame.link import Link
-from isac_rt.propagation import PathKind
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
-from isac_rt.scenario.file import ScenarioError, load
-from isac_rt.scenario.tree import Clutter
+from isac_rt.propagation.pathset import PathKind
+from isac_rt.propagation.settings import Clutter
+from isac_rt.scenario.file import load
 from isac_rt.simulation.setup import prepare, trace
 
 SCENES = Path(__file__).parents[2] / "scenes"

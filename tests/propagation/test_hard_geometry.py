@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from isac_rt import scenario as tree
+from isac_rt.document import ScenarioError, ScenarioWarning
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation import PathKind, PathSet
 from isac_rt.propagation.legs.clearance import CLEARANCE, ClearanceWarning
 from isac_rt.propagation.legs.geometry import unfold
-from isac_rt.scenario.file import ScenarioError, ScenarioWarning, load, to_yaml
+from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.scenario.file import load, to_yaml
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.methods import Auto
 from isac_rt.simulation.preflight import check_flights, warn_of_aliases
@@ -312,7 +313,7 @@ def test_a_path_without_length_is_not_a_number_and_refused():
     with np.errstate(all="ignore"):
         legs = unfold(np.zeros((1, 0, 3)), np.zeros((1, 0)), here, here)
     assert legs.length[0] == 0 and not np.isfinite(legs.rate).all()
-    from isac_rt.propagation import make_paths
+    from isac_rt.propagation.pathset import make_paths
 
     with pytest.raises(ValueError, match="not finite"):
         make_paths(

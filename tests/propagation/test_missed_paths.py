@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from isac_rt.frame.link import Link
-from isac_rt.propagation import PathSet, Traced
+from isac_rt.propagation.model import Traced
+from isac_rt.propagation.pathset import PathSet
 from isac_rt.scenario.file import load
 from isac_rt.simulation.audit import missed_per_frame, present, tracer_of
 from isac_rt.simulation.setup import Setup, prepare

@@ -17,8 +17,9 @@ from isac_rt.propagation.legs.geometry import (
 )
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.rcs import CrossSection, large_uav_db
-from isac_rt.scenario.swarm import Rcs, Uav
+from isac_rt.scenario.swarm import Uav
 from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.settings import Rcs
 from isac_rt.world.swarm import Pose, attitude
 
 C = 299_792_458.0

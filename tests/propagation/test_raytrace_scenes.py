@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from isac_rt import scenario
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation import FreeSpace, PathKind, PathSet
+from isac_rt.propagation.free_space import FreeSpace
+from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.simulation.setup import propagation_in
 from isac_rt.world.city import CityMesh, Material, load_city
 from isac_rt.world.city.mesh import empty_city

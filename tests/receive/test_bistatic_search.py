@@ -9,7 +9,6 @@ from receiver_cubes import ANTENNAS, Path, cube, frame
 
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive import receive_passive
 from isac_rt.receive.clutter.adaptive import scanned
 from isac_rt.receive.clutter.bistatic import (
     _Beam,
@@ -20,10 +19,10 @@ from isac_rt.receive.clutter.bistatic import (
 )
 from isac_rt.receive.estimate import LocalSpectra, refine
 from isac_rt.receive.known import Known
-from isac_rt.receive.passive import PassiveReceiver
+from isac_rt.receive.passive import PassiveReceiver, receive_passive
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import ExpectedClutter
-from isac_rt.scenario.receivers import Receivers
 
 W = Waveform(num_samples=256, num_chirps=24)
 SEARCH = search_of(ANTENNAS, 2 * np.pi * float(W.carrier()) / 299792458.0)

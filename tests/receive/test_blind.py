@@ -11,8 +11,9 @@ from receiver_cubes import ANTENNAS, C, Path, cube, frame
 
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.symbols.blind import Peaks, _comb, _Seen, acquire, find_peaks, read_peaks
-from isac_rt.scenario.receivers import Receivers, Tracking
+from isac_rt.terminal.settings import Tracking
 from isac_rt.terminal.terminal import PassiveTerminal, TerminalState
 from isac_rt.world.swarm import Pose
 

@@ -13,7 +13,7 @@ from scipy import stats
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive import receive_active
+from isac_rt.receive.active import receive_active
 from isac_rt.receive.arms import all_channels, arm, both_arms
 from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.clutter.adaptive import expected_count, scanned
@@ -23,9 +23,9 @@ from isac_rt.receive.clutter.power import Taper, expected_power
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import ExpectedClutter
-from isac_rt.scenario.receivers import Receivers
 
 SHORT = Waveform(num_samples=256, num_chirps=60)
 FEW = replace(ANTENNAS, rx_x=3, rx_z=2)

@@ -11,11 +11,12 @@ from receiver_cubes import ANTENNAS, Path, cube, frame, known
 from scipy import ndimage
 
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Prediction, receive_active
+from isac_rt.receive.active import receive_active
 from isac_rt.receive.clutter.filter import occupied_factor, remove_standing, runs
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import demodulate
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.types import Prediction
 
 SHORT = Waveform(num_samples=256)  # the paper's range cells, a quarter of its range and time
 FEW = replace(ANTENNAS, rx_x=3, rx_z=2)

@@ -11,8 +11,8 @@ from isac_rt.receive.clutter import correction
 from isac_rt.receive.clutter.angle_doppler import AngleDoppler
 from isac_rt.receive.clutter.correction import UNTAPERED, fit
 from isac_rt.receive.clutter.power import TAPER, Response, expected_power
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import ExpectedClutter
-from isac_rt.scenario.receivers import Receivers
 
 C = 299_792_458.0
 W = Waveform(num_samples=256)

@@ -14,8 +14,8 @@ from isac_rt.receive.clutter.angle_doppler import AngleDoppler
 from isac_rt.receive.clutter.coherent import searches
 from isac_rt.receive.clutter.gates import gates_of, seek
 from isac_rt.receive.known import Known
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import ExpectedClutter, Gates
-from isac_rt.scenario.receivers import Receivers
 
 W = Waveform(num_samples=256, num_chirps=60)
 ARRAY = replace(ANTENNAS, rx_x=4, rx_z=3)

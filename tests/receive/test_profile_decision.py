@@ -11,10 +11,9 @@ from receiver_cubes import ANTENNAS, Path, cube, frame
 
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Prediction
 from isac_rt.receive.symbols.powers import confidence_threshold
 from isac_rt.receive.symbols.profile import ByProfile, correlate, learn_profile
-from isac_rt.receive.types import Detections
+from isac_rt.receive.types import Detections, Prediction
 
 SHORT = Waveform(num_samples=256, num_chirps=60)
 

@@ -13,10 +13,11 @@ from scipy import special, stats
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import gray_bits
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Prediction, receive_passive
+from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.symbols.beams import _likelihood, _log_bessel, _table, demodulate_beams
 from isac_rt.receive.symbols.powers import demodulate
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.types import Prediction
 
 LENGTH, RATE, ARRIVAL = 43.817, -11.37, (0.31, -0.22)
 SHORT = Waveform(num_samples=256, num_chirps=120)

@@ -15,7 +15,8 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload, random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Prediction, receive_passive
+from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import (
     Symbols,
@@ -25,7 +26,7 @@ from isac_rt.receive.symbols.powers import (
     known_cycles,
     moves_as_predicted,
 )
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.types import Prediction
 
 FEW = replace(ANTENNAS, rx_x=2, rx_z=2)  # three receivers: what needs no aperture runs faster
 LENGTH, RATE, ARRIVAL, DEPARTURE = 43.817, -11.37, (0.31, -0.22), (-0.17, 0.26)

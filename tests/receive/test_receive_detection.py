@@ -15,7 +15,7 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
-from isac_rt.receive import receive_active, receive_passive
+from isac_rt.receive.active import receive_active
 from isac_rt.receive.cfar import (
     CfarRule,
     greatest_of_factor,
@@ -50,9 +50,10 @@ from isac_rt.receive.maps import (
     union_operator,
 )
 from isac_rt.receive.omp import Omp, omp, pursued
+from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.sense import Cfar
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.scenario.receivers import Receivers
 
 FEW = replace(ANTENNAS, rx_x=2, rx_z=2)  # three receivers: what needs no aperture runs faster
 SETTINGS = Receivers()

@@ -11,8 +11,8 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.schedule import codes_of, conventional_schedule, schedule_of
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Sweep, Waveform
-from isac_rt.receive import receive_active
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.active import receive_active
+from isac_rt.receive.settings import Receivers
 
 RANGE, VELOCITY, U = 21.37, -7.3, (0.21, -0.13)
 

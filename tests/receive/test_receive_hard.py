@@ -14,11 +14,12 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import receive_active, receive_passive
+from isac_rt.receive.active import receive_active
 from isac_rt.receive.chain import cfar_of
 from isac_rt.receive.maps import own_bins
+from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.scenario.receivers import Receivers
 
 FEW = replace(ANTENNAS, rx_x=2, rx_z=2)
 ALIKE = 3

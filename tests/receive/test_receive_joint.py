@@ -13,7 +13,7 @@ from receiver_cubes import ANTENNAS, frame, known
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Prediction, receive_active, receive_passive
+from isac_rt.receive.active import receive_active
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.joint.fit import Fit, _Descent, energy, fit, places, residual_channels
 from isac_rt.receive.joint.interaction import IGNORED, TANGENTS, clusters, ignored, shared
@@ -34,9 +34,10 @@ from isac_rt.receive.joint.tones import (
     rate_bin,
     units,
 )
+from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.symbols.phases import decide_phases
-from isac_rt.receive.types import Detections
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.types import Detections, Prediction
 
 ONE_DB = 10**0.1
 FEW = replace(ANTENNAS, rx_x=3, rx_z=4)

@@ -12,13 +12,14 @@ from slow_pursuit import pursue as pursue_slowly
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive import pursuit, receive_active
+from isac_rt.receive import pursuit
+from isac_rt.receive.active import receive_active
 from isac_rt.receive.chain import cfar_of
 from isac_rt.receive.estimate import Estimate, LocalSpectra
 from isac_rt.receive.pursuit import Pursuit, _add, _Path, _take_out
 from isac_rt.receive.sense import describe
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.scenario.receivers import Receivers
 
 FEW = replace(ANTENNAS, rx_x=3, rx_z=3)
 W = Waveform(num_samples=256, num_groups=1)

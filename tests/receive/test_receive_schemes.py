@@ -12,12 +12,14 @@ from receiver_cubes import ANTENNAS, Path, cube
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Prediction, receive_active, receive_passive
+from isac_rt.receive.active import receive_active
 from isac_rt.receive.chain import cfar_of
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import Conventional, LatinUnion, conventional_power, own_bins
 from isac_rt.receive.omp import Omp, recovery_limit
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.settings import Receivers
+from isac_rt.receive.types import Prediction
 
 FEW = replace(ANTENNAS, rx_x=2, rx_z=2)  # three receivers: what needs no aperture runs faster
 SETTINGS = Receivers()

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 from receiver_cubes import ANTENNAS, Path, cube, frame
 
-from isac_rt.receive import receive_active, spectrum
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive import spectrum
+from isac_rt.receive.active import receive_active
+from isac_rt.receive.settings import Receivers
 
 
 def test_receivers_of_one_cube_share_what_they_clean_and_hear_what_they_hear_alone(monkeypatch):

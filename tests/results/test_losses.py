@@ -14,10 +14,10 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.maps import power_map
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.results.labels import Places
 from isac_rt.results.losses import Chance, Loss, Sensitivity, cause_of, single_look
-from isac_rt.scenario.receivers import Receivers
 from isac_rt.world.swarm import Pose
 
 W = Waveform(num_samples=128, num_chirps=24)

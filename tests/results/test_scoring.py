@@ -13,10 +13,10 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, waveform_of
 from isac_rt.propagation.pathset import PathKind, make_paths
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections, Reception
 from isac_rt.results.losses import Loss
 from isac_rt.results.scoring import Heard, Scorer
-from isac_rt.scenario.receivers import Receivers
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import swarm_of, timetable_of

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from isac_rt.scenario.document import ScenarioError
+from isac_rt.document import ScenarioError
+from isac_rt.hardware.settings import FrontEnd, Oscillator
 from isac_rt.scenario.file import load, to_yaml
-from isac_rt.scenario.front_end import FrontEnd, Oscillator
 from isac_rt.scenario.tree import Scenario
 
 SWARM = {

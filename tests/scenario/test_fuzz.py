@@ -25,8 +25,9 @@ from hypothesis import strategies as st
 
 from isac_rt import scenario as tree
 from isac_rt.cli.cli import main
+from isac_rt.document import ScenarioError, ScenarioWarning
 from isac_rt.runtime import of_machine
-from isac_rt.scenario.file import ScenarioError, ScenarioWarning, load
+from isac_rt.scenario.file import load
 from isac_rt.sweep import SweepError, load_sweep
 from isac_rt.world.city import CityError, load_city
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from isac_rt.document import ScenarioError
 from isac_rt.frame.antennas import antennas_of, ti_cascade
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.scenario.document import ScenarioError
 from isac_rt.scenario.file import load, to_yaml
 from isac_rt.scenario.sensors import SENSORS
 

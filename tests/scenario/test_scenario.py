@@ -16,13 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from isac_rt.document import MAX_MESSAGES, ScenarioError, ScenarioWarning, _models_in
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.scenario.document import MAX_MESSAGES, ScenarioError, _models_in
-from isac_rt.scenario.environment import CITY_KEYS, City
-from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
-from isac_rt.scenario.node import Node
+from isac_rt.scenario.file import load, to_yaml
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario, json_schema
+from isac_rt.settings import Node
+from isac_rt.world.settings import CITY_KEYS, City
 
 SCENES = Path(__file__).parents[2] / "scenes"
 BASE = """\

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from isac_rt.cli.cli import main
+from isac_rt.document import ScenarioError
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
-from isac_rt.scenario.file import ScenarioError, load, to_yaml
+from isac_rt.scenario.file import load, to_yaml
 from isac_rt.signal.choice import (
     CANDIDATES,
     DIRECT,

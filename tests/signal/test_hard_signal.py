@@ -10,9 +10,11 @@ import pytest
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.propagation import PathKind, PathSet, make_paths
-from isac_rt.receive import Prediction, receive_active, receive_passive
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
+from isac_rt.receive.active import receive_active
+from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.settings import Receivers
+from isac_rt.receive.types import Prediction
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.gridded import GRIDDED_ERROR
 from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, Method

@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS
 
+from isac_rt.document import ScenarioError
 from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
-from isac_rt.receive import receive_active
+from isac_rt.receive.active import receive_active
 from isac_rt.receive.known import Known
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.scenario.file import ScenarioError, load
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.scenario.file import load
 from isac_rt.signal.gridded import ACCURATE, GRIDDED_ERROR, PROFILES
 from isac_rt.signal.if_signal import add_noise, if_signal, range_profiles
 from isac_rt.signal.methods import Auto, Exact

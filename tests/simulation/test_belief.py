@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from talking import scenario
 
-from isac_rt.scenario.document import ScenarioError
-from isac_rt.scenario.environment import Belief
+from isac_rt.document import ScenarioError
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare
 from isac_rt.terminal import standing
+from isac_rt.terminal.settings import Belief
 
 SCENES = Path(__file__).parents[2] / "scenes"
 

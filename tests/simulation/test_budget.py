@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from isac_rt.cli.cli import main
 from isac_rt.frame.link import Link
-from isac_rt.propagation import PathKind
+from isac_rt.propagation.pathset import PathKind
 from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import audit, simulate

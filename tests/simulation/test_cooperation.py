@@ -7,21 +7,22 @@ import pytest
 from talking import scenario
 from test_resume import Stopped, assert_equal_results, stopping_at
 
+from isac_rt.access.settings import Access
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Reception
-from isac_rt.receive.types import Detections
+from isac_rt.receive.settings import Receivers
+from isac_rt.receive.types import Detections, Reception
 from isac_rt.results.dataset import fused_positions
 from isac_rt.results.provenance import run_content
 from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM
-from isac_rt.scenario.receivers import Receivers, ReceiverSet, Tracking
-from isac_rt.scenario.swarm import Access
+from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.simulation import simulate
 from isac_rt.simulation.cooperation import look_of
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.simulate import standard_terminal
 from isac_rt.terminal.filter import Gaussian, measure
+from isac_rt.terminal.settings import Tracking
 from isac_rt.terminal.tracker import Track, track_set
 from isac_rt.views.animate import animate
 from isac_rt.views.moving_scene import moving_scene

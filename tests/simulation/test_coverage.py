@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from isac_rt.scenario.file import ScenarioWarning
+from isac_rt.document import ScenarioWarning
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.audit import make_plan

@@ -10,12 +10,12 @@ import pytest
 
 from isac_rt.access.fall_back import Schedules
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
+from isac_rt.frame.settings import Array, Modulation, Noise
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Reception
-from isac_rt.receive.types import no_detections
+from isac_rt.propagation.settings import Propagation
+from isac_rt.receive.types import Reception, no_detections
 from isac_rt.scenario.doubts import doubts
-from isac_rt.scenario.environment import Propagation
-from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
+from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate

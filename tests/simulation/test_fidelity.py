@@ -12,7 +12,7 @@ import pytest
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.schedule import schedule_of
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, waveform_of
-from isac_rt.propagation import PathKind, PathSet, make_paths
+from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.randomness import generator
 from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario

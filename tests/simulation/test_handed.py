@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from isac_rt.access import Correction, Establishment
+from isac_rt.access.feedback import Correction
+from isac_rt.access.protocol import Establishment
+from isac_rt.access.settings import Access
 from isac_rt.frame.link import Link
-from isac_rt.receive import Reception
-from isac_rt.receive.types import no_detections
-from isac_rt.scenario.environment import Propagation
-from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
-from isac_rt.scenario.swarm import Access, Uav
+from isac_rt.frame.settings import Array, Modulation, Noise
+from isac_rt.propagation.settings import Propagation
+from isac_rt.receive.types import Reception, no_detections
+from isac_rt.scenario.radio import Radio
+from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import setup as setting_up
 from isac_rt.simulation import simulate

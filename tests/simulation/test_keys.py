@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 
 from isac_rt import storage
+from isac_rt.document import ScenarioWarning
 from isac_rt.frame.link import Link
 from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.results import provenance
 from isac_rt.results.provenance import UNSEEN_BY_PATHS, path_content, run_content
-from isac_rt.scenario.file import ScenarioWarning, load
+from isac_rt.scenario.file import load
 from isac_rt.storage import PACKAGES
 from isac_rt.studies.paper import montecarlo
 from isac_rt.sweep.definition import ground_of, load_sweep, paths_key, point_key

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from isac_rt.document import ScenarioError, ScenarioWarning
 from isac_rt.frame.antennas import Antennas
-from isac_rt.receive import receive_passive
 from isac_rt.receive.active import receive_active
+from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.types import Reception, no_detections
-from isac_rt.scenario.document import ScenarioError
-from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
+from isac_rt.scenario.file import load, to_yaml
 from isac_rt.scenario.swarm import Uav
 from isac_rt.simulation.setup import prepare
 from isac_rt.simulation.simulate import run

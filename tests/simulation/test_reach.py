@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from isac_rt.propagation import PathKind, PathSet
 from isac_rt.propagation.clutter.cells import Density, area_for, error_for
+from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.audit import make_plan

@@ -20,16 +20,19 @@ from test_fall_back import scenario as dense_scenario
 
 from isac_rt.cli.cli import main
 from isac_rt.cli.interruption import Terminated
+from isac_rt.document import ScenarioWarning
+from isac_rt.receive.settings import Receivers
 from isac_rt.results.files import open_results
 from isac_rt.results.provenance import run_content
 from isac_rt.results.recorder import Recorder
-from isac_rt.scenario.file import ScenarioWarning, load, to_yaml
-from isac_rt.scenario.receivers import Receivers, ReceiverSet, Tracking
+from isac_rt.scenario.file import load, to_yaml
+from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.simulation import resume as simulate_resume
 from isac_rt.simulation import simulate
 from isac_rt.simulation.resume import EARLIER, FILE, Resume, ResumeError
 from isac_rt.simulation.setup import prepare
 from isac_rt.storage import ARRAY, checksum, pack, unpack
+from isac_rt.terminal.settings import Tracking
 
 ROOT = Path(__file__).parents[2]
 SCENES = ROOT / "scenes"

@@ -15,7 +15,7 @@ from captures import Step, flat, save_capture
 from threadpoolctl import threadpool_limits
 
 from isac_rt import runtime
-from isac_rt.propagation import PathKind
+from isac_rt.propagation.pathset import PathKind
 from isac_rt.results.files import open_results, save
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate

@@ -13,7 +13,7 @@ from scipy import stats
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.settings import Receivers
 from isac_rt.studies.baselines import (
     Echoes,
     LoRadar,

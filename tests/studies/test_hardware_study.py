@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.scenario.front_end import FrontEnd
+from isac_rt.hardware.settings import FrontEnd
 from isac_rt.studies.paper import front_ends, hardware
 
 

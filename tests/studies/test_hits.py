@@ -13,7 +13,7 @@ from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.randomness import generator
-from isac_rt.receive import receive_active
+from isac_rt.receive.active import receive_active
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.omp import omp
 from isac_rt.studies.baselines import resolution

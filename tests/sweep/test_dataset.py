@@ -15,8 +15,8 @@ import pytest
 from test_sweep import BASE
 
 import isac_rt as irt
+from isac_rt.document import ScenarioError
 from isac_rt.results.files import ResultsError
-from isac_rt.scenario.file import ScenarioError
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import prepare
 from isac_rt.sweep import Samples, load_dataset

@@ -21,13 +21,15 @@ import xarray as xr
 
 import isac_rt
 from isac_rt.cli.cli import main
+from isac_rt.document import ScenarioError
 from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.results.files import ResultsError
 from isac_rt.results.metrics import binomial_interval
 from isac_rt.results.provenance import UNSEEN_BY_PATHS
-from isac_rt.scenario.file import ScenarioError, load, plain_tree
+from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
+from isac_rt.settings import plain_tree
 from isac_rt.simulation.setup import prepare
 from isac_rt.simulation.simulate import summarise
 from isac_rt.sweep import Outcomes, load_sweep, open_sweep, run_sweep, save_dataset, status

@@ -19,9 +19,9 @@ from test_sweep import BASE, SWEEP, job_of, plan_of, run_here, same, start_clien
 
 from isac_rt import storage
 from isac_rt.cli.cli import main
+from isac_rt.document import ScenarioError
 from isac_rt.propagation.store import PathStore
 from isac_rt.results.files import ResultsError
-from isac_rt.scenario.document import ScenarioError
 from isac_rt.sweep import Outcomes, PointsLeft, execute, open_sweep, run_sweep, save_dataset, status
 from isac_rt.sweep.definition import Point
 from isac_rt.sweep.execute import ROOM, run_job

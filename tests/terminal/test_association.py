@@ -12,8 +12,8 @@ from scipy.optimize import brentq
 from scipy.stats import chi2
 
 from isac_rt.receive.types import Detections
-from isac_rt.scenario.receivers import Tracking
 from isac_rt.terminal.filter import STD_FLOOR, UNAMBIGUOUS, Ambiguity, Gaussian, costs
+from isac_rt.terminal.settings import Tracking
 from isac_rt.terminal.tracker import Track, Tracker, assign
 from isac_rt.world.swarm import Pose, attitude
 

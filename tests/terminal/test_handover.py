@@ -15,10 +15,10 @@ from receiver_cubes import ANTENNAS
 
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive import Reception
-from isac_rt.receive.types import Correction, Detections, ExpectedClutter, no_detections
-from isac_rt.scenario.receivers import Receivers, Tracking
+from isac_rt.receive.settings import Receivers
+from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Reception, no_detections
 from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.settings import Tracking
 from isac_rt.terminal.terminal import (
     ActiveTerminal,
     PassiveTerminal,

@@ -10,9 +10,10 @@ from test_images import ORIGIN, VELOCITY, WALL, city, pose
 
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections
-from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.terminal.filter import Gaussian, measure
+from isac_rt.terminal.settings import Tracking
 from isac_rt.terminal.terminal import PassiveTerminal, Surroundings
 from isac_rt.terminal.tracker import Track
 from isac_rt.world.swarm import Pose

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from test_images import ANTENNAS, ORIGIN, W, city
 
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections, Reception, no_detections
 from isac_rt.scenario.file import load
-from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.simulation.setup import prepare
 from isac_rt.terminal.filter import Gaussian, measure, reflected
 from isac_rt.terminal.ghosts import Walls
 from isac_rt.terminal.mirrors import mirror_of
+from isac_rt.terminal.settings import Tracking
 from isac_rt.terminal.terminal import ActiveTerminal
 from isac_rt.world.swarm import Pose, attitude
 

@@ -15,11 +15,12 @@ from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.clutter.neighbours import phases
 from isac_rt.receive.known import Known
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import ExpectedClutter, Look
-from isac_rt.scenario.receivers import Receivers, Tracking
 from isac_rt.storage import pack, unpack
 from isac_rt.terminal.filter import Gaussian
 from isac_rt.terminal.self_calibration import FREE, Change, SelfCalibration, Sight
+from isac_rt.terminal.settings import Tracking
 from isac_rt.terminal.sights import seen_after
 from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal
 from isac_rt.world.swarm import Pose

@@ -11,7 +11,6 @@ import pytest
 from scipy.stats import chi2
 
 from isac_rt.receive.types import Detections
-from isac_rt.scenario.receivers import Tracking
 from isac_rt.terminal.filter import (
     BIRTH_SPEED_STD,
     STD_FLOOR,
@@ -29,6 +28,7 @@ from isac_rt.terminal.filter import (
     update,
     wrapped,
 )
+from isac_rt.terminal.settings import Tracking
 from isac_rt.terminal.tracker import Track, Tracker, assign, united
 from isac_rt.world.swarm import Pose, attitude
 

@@ -12,11 +12,12 @@ import pytest
 from isac_rt.capture.readers import read_sigmf
 from isac_rt.capture.store import cube_dataset, load_cube, save_cube
 from isac_rt.frame.cube import IFCube
+from isac_rt.frame.settings import Array, Modulation, Noise
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind
+from isac_rt.propagation.settings import Propagation
 from isac_rt.results.files import ResultsError
-from isac_rt.scenario.environment import Propagation
-from isac_rt.scenario.radio import Array, Modulation, Noise, Radio
+from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
@@ -97,9 +98,9 @@ def test_paths_of_sionna_are_those_of_geometry():
     import mitsuba as mi
     import sionna.rt as rt
 
-    from isac_rt.scenario.environment import City
     from isac_rt.world.city import load_city
     from isac_rt.world.city.scene import build_scene
+    from isac_rt.world.settings import City
 
     scene = build_scene(
         load_city(City(source="builtin", name="floor_wall"), ".", 77e9, (0.0, 0.0, 0.0)), 77e9

@@ -10,7 +10,6 @@ import xarray as xr
 from fake_run import fake_run
 
 from isac_rt.propagation.pathset import PathKind
-from isac_rt.scenario.environment import City
 from isac_rt.views.report import wall_table
 from isac_rt.views.tables import (
     error_table,
@@ -22,6 +21,7 @@ from isac_rt.views.tables import (
     target_table,
 )
 from isac_rt.world.city import load_city
+from isac_rt.world.settings import City
 
 
 @pytest.fixture(scope="module")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from isac_rt.document import ScenarioError
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.rcs import CrossSection
-from isac_rt.scenario.aspect import AspectTable
-from isac_rt.scenario.document import ScenarioError
 from isac_rt.scenario.file import load, to_yaml
+from isac_rt.settings import AspectTable
 from isac_rt.sweep import load_sweep
 from isac_rt.world.aspect import in_table
 from isac_rt.world.swarm import Trajectory, turned

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isac_rt.scenario.document import ScenarioError
+from isac_rt.document import ScenarioError
 from isac_rt.scenario.file import load
 from isac_rt.scenario.swarm import Uav
 from isac_rt.simulation.setup import prepare

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.scenario.swarm import Uav, Waypoint
+from isac_rt.scenario.swarm import Uav
+from isac_rt.world.settings import Waypoint
 from isac_rt.world.swarm import Pose, Swarm, Trajectory, attitude
 
 WAYPOINTS = tuple(

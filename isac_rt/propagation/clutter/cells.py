@@ -16,8 +16,8 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from isac_rt.kernels.jit import jit
+from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import seed_sequence, splitmix64
-from isac_rt.scenario.environment import Clutter
 from isac_rt.world.city.mesh import CityMesh
 
 UNIT = 1e-6 * np.sqrt(2)

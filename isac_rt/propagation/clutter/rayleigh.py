@@ -32,8 +32,8 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.model import Census, Propagation, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
+from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import generator
-from isac_rt.scenario.environment import Clutter
 from isac_rt.world.swarm import Pose
 
 

@@ -3,14 +3,14 @@ shadow."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from isac_rt.kernels.jit import jit
 from isac_rt.propagation.legs.diffraction import LIT_REACH, disc, fresnel_unit, tapered
-from isac_rt.scenario.swarm import Uav
+from isac_rt.world.settings import Uav
 from isac_rt.world.swarm import Pose
 
 
@@ -30,7 +30,7 @@ class Bodies:
     radii: np.ndarray
 
     @classmethod
-    def of(cls, uavs: dict[str, Uav], poses: dict[str, Pose]) -> Bodies:
+    def of(cls, uavs: Mapping[str, Uav], poses: dict[str, Pose]) -> Bodies:
         """Bodies of a scenario's UAVs where they are."""
         names = tuple(name for name, uav in uavs.items() if uav.body_radius_m > 0 and name in poses)
         places = np.array([poses[name].position for name in names]).reshape(-1, 3)

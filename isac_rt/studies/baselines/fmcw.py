@@ -23,8 +23,8 @@ from isac_rt.frame.schedule import Schedule, conventional_schedule
 from isac_rt.frame.waveform import Waveform, hann
 from isac_rt.receive.cfar import first_row
 from isac_rt.receive.estimate import to_delay
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections
-from isac_rt.scenario.receivers import Receivers
 from isac_rt.studies.baselines.tdm import sense_tdm
 
 

@@ -43,8 +43,8 @@ from scipy import stats
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.receive.cfar import first_row
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections
-from isac_rt.scenario.receivers import Receivers
 from isac_rt.studies.baselines.tdm import sense_tdm
 
 Detector = Literal["energy", "coherent"]

@@ -14,8 +14,8 @@ from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate
 from isac_rt.receive.sense import describe
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections
-from isac_rt.scenario.receivers import Receivers
 
 SIDELOBES = 1e-6
 """Share of a path's power that may lie in any Doppler bin of its range row: Hann's far sidelobes

@@ -27,8 +27,8 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections, Prediction, Reception
-from isac_rt.scenario.receivers import Receivers
 from isac_rt.signal.if_signal import add_noise, if_signal
 from isac_rt.signal.methods import Direct
 from isac_rt.studies.bench.measure import cpu_seconds, floor_seconds

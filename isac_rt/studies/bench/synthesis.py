@@ -23,10 +23,10 @@ from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.hardware.front_end import Ends, front_end_of
+from isac_rt.hardware.settings import FrontEnd
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.known import Known
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.signal.gridded import ACCURATE, COVERING, DEFAULT, PROFILES, Setting
 from isac_rt.signal.if_signal import if_signal, range_profiles
 from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, Method

@@ -13,8 +13,9 @@ from typing import Any
 
 from isac_rt.randomness import seed_sequence
 from isac_rt.results.recorder import Results
-from isac_rt.scenario.file import load, plain_tree
+from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import OWN, Scenario
+from isac_rt.settings import plain_tree
 from isac_rt.studies import scene_file
 from isac_rt.studies.paper.outcome import Progress
 from isac_rt.sweep.definition import Point, files_under, ground_by, paths_key, point_key

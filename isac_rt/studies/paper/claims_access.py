@@ -12,8 +12,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 from scipy import stats
 
-from isac_rt.access import Clock, Network, correct, establish, isolation, summarise
-from isac_rt.access.feedback import frames_to_repair
+from isac_rt.access.dma import isolation
+from isac_rt.access.feedback import correct, frames_to_repair, summarise
+from isac_rt.access.protocol import Clock, Network, establish
 from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.frame.link import Link
 from isac_rt.frame.payload import random_payload
@@ -22,9 +23,9 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT as C
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathSet
 from isac_rt.randomness import generator
-from isac_rt.receive import receive_passive
+from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.settings import Receivers
 from isac_rt.results.metrics import SymbolCount, count_symbols
-from isac_rt.scenario.receivers import Receivers
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Direct
 from isac_rt.studies.paper import onepath

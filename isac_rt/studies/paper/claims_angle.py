@@ -12,9 +12,9 @@ from isac_rt.frame.schedule import Schedule, conventional_schedule, pseudo_rando
 from isac_rt.frame.waveform import SPEED_OF_LIGHT as C
 from isac_rt.frame.waveform import Waveform
 from isac_rt.randomness import generator
-from isac_rt.receive import receive_active
+from isac_rt.receive.active import receive_active
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.symbols.powers import demodulate
-from isac_rt.scenario.receivers import Receivers
 from isac_rt.studies.paper import onepath
 from isac_rt.studies.paper.outcome import Progress, Sentences, Verdict, proportion, table
 from isac_rt.studies.waves import prediction

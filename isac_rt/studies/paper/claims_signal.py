@@ -15,12 +15,12 @@ from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT as C
 from isac_rt.frame.waveform import Waveform
 from isac_rt.randomness import generator
-from isac_rt.receive import receive_passive
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
+from isac_rt.receive.passive import receive_passive
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import demodulate
-from isac_rt.scenario.receivers import Receivers
 from isac_rt.studies.paper import fig5, onepath
 from isac_rt.studies.paper.outcome import Progress, Sentences, Verdict, proportion, table
 from isac_rt.studies.waves import prediction

@@ -27,17 +27,17 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.free_space import friis_amplitude, radar_amplitude
 from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.propagation.settings import Clutter
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.clutter.filter import remove_standing
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import decide, decide_transitions, known_cycles
 from isac_rt.receive.symbols.profile import correlate, learn_profile
-from isac_rt.scenario.environment import Clutter
-from isac_rt.scenario.receivers import Receivers
 from isac_rt.signal.if_signal import add_noise, if_signal
 from isac_rt.signal.methods import Auto
 from isac_rt.studies.paper import clutter_statistics as numbers

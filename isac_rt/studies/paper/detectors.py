@@ -30,10 +30,10 @@ from isac_rt.receive.clutter.angle_doppler import AngleDoppler, noise_level
 from isac_rt.receive.clutter.power import cells_of, expected_power
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.results.metrics import binomial_interval
-from isac_rt.scenario.receivers import Receivers
 from isac_rt.studies.paper.clutter_scenes import (
     PLACES,
     SPEED,

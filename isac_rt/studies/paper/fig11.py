@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from isac_rt.frame.payload import MODULATION_ORDERS
 from isac_rt.randomness import generator
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.settings import Receivers
 from isac_rt.studies.baselines import LoRadar, loradar_symbol_errors
 from isac_rt.studies.paper.fig12 import SNR_DB, clutter_verdict, draw_rate
 from isac_rt.studies.paper.montecarlo import (

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from isac_rt.frame.payload import MODULATION_ORDERS
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.symbols.powers import EXTRA_CELLS
-from isac_rt.scenario.receivers import Receivers
 from isac_rt.studies.paper.montecarlo import INTERVAL, Curve, Precision, Steps, delay_error_rate
 from isac_rt.studies.paper.outcome import (
     Outcome,

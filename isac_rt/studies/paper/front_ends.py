@@ -24,13 +24,13 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.hardware.front_end import IDEAL, Ends, front_end_of
 from isac_rt.hardware.front_end import FrontEnd as Built
 from isac_rt.hardware.oscillator import Mask
+from isac_rt.hardware.settings import FrontEnd, Oscillator
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.arms import arm
 from isac_rt.receive.cfar import CfarRule
-from isac_rt.scenario.front_end import FrontEnd, Oscillator
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.settings import Receivers
 from isac_rt.signal.methods import Direct
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.signal.received import received

@@ -20,9 +20,9 @@ from isac_rt.frame.payload import MODULATION_ORDERS
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.hardware.oscillator import Mask, spread
+from isac_rt.hardware.settings import FrontEnd, Oscillator
 from isac_rt.randomness import generator
 from isac_rt.scenario.file import load
-from isac_rt.scenario.front_end import FrontEnd, Oscillator
 from isac_rt.simulation import simulate
 from isac_rt.studies import scene_file
 from isac_rt.studies.paper.front_ends import BOARDS, FLOORS, Bias, biases, floor, instants

@@ -29,8 +29,8 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.pathset import PathKind
+from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import generator
-from isac_rt.receive import Prediction
 from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.clutter.filter import remove_standing
 from isac_rt.receive.estimate import Estimate, LocalSpectra, refine, start_point, to_delay
@@ -38,10 +38,10 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.passive import GATE_BINS, GATE_CELLS, predicted_cell
 from isac_rt.receive.sense import describe
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum, tones
 from isac_rt.receive.symbols.powers import demodulate
-from isac_rt.scenario.environment import Clutter
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.types import Prediction
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct
 from isac_rt.studies.baselines import Echoes, LoRadar, fmcw_frame, loradar_frame, resolution

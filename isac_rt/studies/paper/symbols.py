@@ -22,13 +22,13 @@ from isac_rt.frame.payload import Payload, running_phases
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.hardware.front_end import Ends, front_end_of
+from isac_rt.hardware.settings import FrontEnd
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.pathset import PathKind, merge
+from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import generator
 from isac_rt.receive.clutter.filter import runs
 from isac_rt.receive.symbols.powers import WEAKEST_WEIGHT, decide, decide_transitions, known_cycles
-from isac_rt.scenario.environment import Clutter
-from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct
 from isac_rt.signal.noise import WhiteNoise

@@ -9,15 +9,15 @@ import numpy as np
 from scipy.integrate import dblquad, quad
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.level import noise_rise, thermal_noise_power
+from isac_rt.frame.level import thermal_noise_power
 from isac_rt.frame.link import Link
+from isac_rt.frame.settings import Noise
 from isac_rt.frame.waveform import Waveform
-from isac_rt.propagation import FreeSpace, PathKind
+from isac_rt.propagation.free_space import FreeSpace
+from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.rcs import CrossSection, large_uav_db
+from isac_rt.propagation.settings import Clutter
 from isac_rt.propagation.ways import LinkState
-from isac_rt.scenario.environment import Clutter
-from isac_rt.scenario.radio import Noise
-from isac_rt.scenario.swarm import Rcs
 from isac_rt.simulation.setup import propagation_in
 from isac_rt.studies.validation import stage, truths
 from isac_rt.studies.validation.case import Errors, case, slow_traced, traced
@@ -25,6 +25,7 @@ from isac_rt.studies.validation.truths import WAVELENGTH, slab_reflection
 from isac_rt.world.city import CityMesh
 from isac_rt.world.city.materials import Material, resolve_materials, water_permittivity
 from isac_rt.world.city.materials import MaterialUse as Use
+from isac_rt.world.settings import Rcs
 
 SIGMA = 10**-1.17
 ROUNDING = "float64 rounding; the largest that was seen is a hundredth of the bound"
@@ -451,7 +452,7 @@ def thermal_noise() -> float:
     """Noise of a complex sample over the sampling rate of 20 MHz with a noise figure of 11.3 dB;
     Gaussian clutter adds in power."""
     found = thermal_noise_power(Noise(noise_figure_db=11.3), Waveform())
-    rise = noise_rise(Clutter(model="gaussian", clutter_to_noise_db=3.0103))
+    rise = Clutter(model="gaussian", clutter_to_noise_db=3.0103).noise_rise
     return max(
         abs(10 * np.log10(found / 1e-3) - (-173.975 + 10 * np.log10(20e6) + 11.3)),
         abs(rise - 3) / 3,

@@ -13,7 +13,7 @@ from isac_rt.frame.cube import Transmission
 from isac_rt.frame.link import Link
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import Waveform
-from isac_rt.propagation import PathKind, make_paths
+from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.cfar import greatest_of_factor
 from isac_rt.results.metrics import gospa
 from isac_rt.scenario.file import load

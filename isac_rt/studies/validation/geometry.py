@@ -11,8 +11,9 @@ from scipy.integrate import quad
 
 from isac_rt import scenario as tree
 from isac_rt.frame.link import Link
-from isac_rt.propagation import FreeSpace, PathKind
+from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.legs.geometry import Legs, plane_of_each_face, straight, unfold
+from isac_rt.propagation.pathset import PathKind
 from isac_rt.studies.validation import stage, truths
 from isac_rt.studies.validation.case import Errors, case, slow_traced, traced
 from isac_rt.studies.validation.truths import chain_length, derivatives, flown, wide

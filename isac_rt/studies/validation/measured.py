@@ -15,11 +15,11 @@ from isac_rt.capture.matfile import read_mat
 from isac_rt.capture.readers import import_file
 from isac_rt.capture.types import MEASURED, Capture, measured_folder, ti_window
 from isac_rt.frame.antennas import Antennas
+from isac_rt.hardware.settings import FrontEnd
 from isac_rt.propagation.rcs import SMALL_MEAN_DBSM, TR38901_STD_DB
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import Conventional, doppler_bins
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.scenario.front_end import FrontEnd
 from isac_rt.studies.validation.case import Errors, Skipped, case
 
 BOARDS = {

@@ -12,9 +12,11 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.level import link_budget
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.schedule import conventional_schedule
+from isac_rt.frame.settings import Noise
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
-from isac_rt.receive import Prediction, receive_active
+from isac_rt.propagation.settings import Clutter
+from isac_rt.receive.active import receive_active
 from isac_rt.receive.arms import arm
 from isac_rt.receive.cfar import CfarRule, greatest_of_factor
 from isac_rt.receive.clutter.filter import remove_standing
@@ -23,11 +25,10 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps, slow_window, union_operator
 from isac_rt.receive.omp import omp
 from isac_rt.receive.sense import Cfar
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import demodulate
-from isac_rt.scenario.environment import Clutter
-from isac_rt.scenario.radio import Noise
-from isac_rt.scenario.receivers import Receivers
+from isac_rt.receive.types import Prediction
 from isac_rt.studies.validation import stage
 from isac_rt.studies.validation.case import Errors, case, slow
 from isac_rt.studies.validation.stage import FEW, FULL

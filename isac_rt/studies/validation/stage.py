@@ -13,7 +13,8 @@ from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import Payload, random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.propagation import PathKind, PathSet, Propagation, make_paths
+from isac_rt.propagation.model import Propagation
+from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.randomness import seed_sequence
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import if_signal

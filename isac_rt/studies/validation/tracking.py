@@ -9,7 +9,6 @@ import numpy as np
 from scipy import stats
 
 from isac_rt.results.metrics import binomial_interval, gospa
-from isac_rt.scenario.receivers import Tracking
 from isac_rt.studies.validation import stage
 from isac_rt.studies.validation.case import Errors, case, slow
 from isac_rt.terminal.filter import (
@@ -24,6 +23,7 @@ from isac_rt.terminal.filter import (
     singer,
     update,
 )
+from isac_rt.terminal.settings import Tracking
 from isac_rt.world.swarm import Pose
 
 ONCE_IN_1E5 = "false alarm 7e-6"

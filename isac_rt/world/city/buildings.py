@@ -12,7 +12,7 @@ from typing import Any
 import shapely
 from pydantic_core import from_json
 
-from isac_rt import scenario
+from isac_rt.world import settings
 from isac_rt.world.city.heights import parse_length, roof_over_ground
 from isac_rt.world.city.materials import CityError
 
@@ -110,7 +110,7 @@ def _value(tags: Tags, key: str) -> Any:
 class _Heights:
     """Reads heights, and counts those that are none."""
 
-    city: scenario.City
+    city: settings.City
     read: int = 0
     wrong: list[str] = field(default_factory=list)
 
@@ -175,14 +175,14 @@ class _Heights:
 
 
 def buildings(
-    features: Sequence[Feature], city: scenario.City, name: str, notes: list[str]
+    features: Sequence[Feature], city: settings.City, name: str, notes: list[str]
 ) -> list[Outline]:
     """The buildings among the features of a map.
 
     Parameters
     ----------
     features : sequence of Feature
-    city : scenario.City
+    city : settings.City
         Which property holds heights, and how high a storey is.
     name : str
         Of the file, for messages.
@@ -218,7 +218,7 @@ def _most(left: Counter[str]) -> int:
     return sum(count for _, count in left.most_common(8))
 
 
-def _no_building(feature: Feature, tags: Tags, city: scenario.City, mapped: bool) -> str | None:
+def _no_building(feature: Feature, tags: Tags, city: settings.City, mapped: bool) -> str | None:
     """What a feature is that is no building; None if it is one."""
     if feature.shape.is_empty:
         return "without a polygon"

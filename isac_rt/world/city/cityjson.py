@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic_core import from_json, to_json
 
-from isac_rt import scenario
+from isac_rt.world import settings
 from isac_rt.world.city.buildings import Outline
 from isac_rt.world.city.extrude import check_corners, triangulate
 from isac_rt.world.city.files import Items, Part, parsed
@@ -233,7 +233,7 @@ def triangulate_planar(rings: list[NDArray[np.float64]]) -> NDArray[np.int64]:
     return triangulate([(ring - rings[0][0]) @ basis for ring in rings])
 
 
-def _material(city: scenario.City, semantic: str | None, kind: str) -> str:
+def _material(city: settings.City, semantic: str | None, kind: str) -> str:
     """Of a surface, by the scenario's `material_map` or by what it is."""
     for name in (semantic, kind):
         if name is not None and name in city.material_map:
@@ -273,7 +273,7 @@ def _triangles(rings: _Rings, vertices: NDArray[np.float64]) -> NDArray[np.int64
 
 
 def _faces(
-    geometry: _Surfaced, vertices: NDArray[np.float64], city: scenario.City, kind: str, what: str
+    geometry: _Surfaced, vertices: NDArray[np.float64], city: settings.City, kind: str, what: str
 ) -> tuple[dict[str, NDArray[np.int64]], NDArray[np.int64]]:
     """Triangles by material, and the vertices of what the file calls ground."""
     semantics = geometry.semantics or _Semantics()
@@ -324,7 +324,7 @@ def _footprint(
 class _Reader:
     """Reads objects of one list of vertices."""
 
-    def __init__(self, document: CityJson, city: scenario.City, name: str) -> None:
+    def __init__(self, document: CityJson, city: settings.City, name: str) -> None:
         self.city, self.name = city, name
         self.header = document
         self.model = CityModel()
@@ -480,14 +480,14 @@ def _has_faces(geometry: _Surfaced | _Instance) -> bool:
     return isinstance(geometry, _Instance) or geometry.lod >= 1
 
 
-def read_cityjson(data: bytes, city: scenario.City, name: str, notes: list[str]) -> CityModel:
+def read_cityjson(data: bytes, city: settings.City, name: str, notes: list[str]) -> CityModel:
     """The surfaces and footprints of a CityJSON file.
 
     Parameters
     ----------
     data : bytes
         CityJSON, or CityJSONSeq: a first line with CityJSON, then one CityJSONFeature a line.
-    city : scenario.City
+    city : settings.City
         Materials, the level of detail, and the attribute with heights; `measuredHeight` is looked
         for besides it.
     name : str

@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from isac_rt import scenario
+from isac_rt.world import settings
 from isac_rt.world.city.buildings import Outline, buildings, moved
 from isac_rt.world.city.cityjson import CityModel, is_sequence, read_cityjson
 from isac_rt.world.city.extrude import Finish, building, polygons_of, roofed
@@ -34,7 +34,7 @@ SEEN_LOWERED_M = 0.5
 """Buildings that go down to the ground by more are counted."""
 
 
-def _model(city: scenario.City, path: Path, notes: list[str]) -> CityModel:
+def _model(city: settings.City, path: Path, notes: list[str]) -> CityModel:
     """What a file holds, in its own coordinates."""
     if path.suffix.lower() in TABLES:
         features, crs = read_table(path, city.layer, notes)
@@ -89,7 +89,7 @@ def _without_strays(model: CityModel, bad: list[str]) -> CityModel:
     return CityModel(model.crs, kept, model.bodies)
 
 
-def _place(city: scenario.City, model: CityModel, name: str, notes: list[str]) -> Place:
+def _place(city: settings.City, model: CityModel, name: str, notes: list[str]) -> Place:
     """Where a city lies, by the scenario, the file, or the size of its numbers."""
     crs = ""
     if city.crs is not None:
@@ -128,7 +128,7 @@ def _moved(model: CityModel, place: Place) -> CityModel:
 
 
 def _ground(
-    city: scenario.City, model: CityModel, terrain: Path | None, place: Place, notes: list[str]
+    city: settings.City, model: CityModel, terrain: Path | None, place: Place, notes: list[str]
 ) -> Ground:
     """What the city stands on."""
     boxes = _boxes(model)
@@ -183,7 +183,7 @@ def _extruded(
 
 
 def _raised(
-    city: scenario.City, outlines: Sequence[Outline], base: Ground, bad: list[str], notes: list[str]
+    city: settings.City, outlines: Sequence[Outline], base: Ground, bad: list[str], notes: list[str]
 ) -> list[Surface]:
     """Buildings over all footprints; bad ones are left out."""
     finish = Finish(
@@ -214,7 +214,7 @@ def _raised(
 
 
 def footprints(
-    city: scenario.City, path: Path, terrain: Path | None = None
+    city: settings.City, path: Path, terrain: Path | None = None
 ) -> tuple[list[Surface], list[str], Place]:
     """Closed buildings and a ground from a map.
 

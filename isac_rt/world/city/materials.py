@@ -38,7 +38,7 @@ from typing import Literal
 import numpy as np
 
 from isac_rt.runtime import UserError
-from isac_rt.scenario.environment import MaterialOverride
+from isac_rt.world.settings import MaterialOverride
 
 Pattern = Literal["lambertian", "directive", "backscattering"]
 VACUUM_PERMITTIVITY = 8.8541878128e-12

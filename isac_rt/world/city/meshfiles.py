@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic_core import from_json
 
-from isac_rt import scenario
+from isac_rt.world import settings
 from isac_rt.world.city.files import beside, read_bytes
 from isac_rt.world.city.materials import CityError, MaterialUse, canonical_name
 from isac_rt.world.city.mesh import MAX_FACES, Surface, gathered
@@ -311,7 +311,7 @@ def mesh_files(path: Path) -> list[Path]:
     return list(dict.fromkeys([path, *(file for file in named if file is not None)]))
 
 
-def _use(labels: tuple[str, ...], city: scenario.City) -> MaterialUse | None:
+def _use(labels: tuple[str, ...], city: settings.City) -> MaterialUse | None:
     """The material of a piece; None if no name of it says."""
     for label in labels:
         if label in city.material_map:
@@ -321,7 +321,7 @@ def _use(labels: tuple[str, ...], city: scenario.City) -> MaterialUse | None:
     return None if name is None else MaterialUse(name)
 
 
-def mesh_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]]:
+def mesh_file(city: settings.City, path: Path) -> tuple[list[Surface], list[str]]:
     """The surfaces of a mesh file in world coordinates: node transforms applied, then scaled, then
     turned z-up.
 

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from isac_rt import scenario
-from isac_rt.scenario.environment import MaterialOverride
+from isac_rt.world import settings
 from isac_rt.world.city.files import beside, read_bytes
 from isac_rt.world.city.materials import (
     DEFAULT_EXPONENT,
@@ -28,6 +27,7 @@ from isac_rt.world.city.materials import (
 )
 from isac_rt.world.city.mesh import Surface, gathered
 from isac_rt.world.city.meshfiles import Piece, pieces
+from isac_rt.world.settings import MaterialOverride
 
 _MESHES = (".ply", ".obj", ".stl")
 _LONGEST = 1000
@@ -153,7 +153,7 @@ def transform_of(reader: _Reader, shape: ET.Element) -> NDArray[np.float64]:
     return total
 
 
-def _material(reader: _Reader, city: scenario.City, bsdf: ET.Element) -> MaterialUse:
+def _material(reader: _Reader, city: settings.City, bsdf: ET.Element) -> MaterialUse:
     name = reader.text(bsdf, "id") or ""
     if name in city.material_map:
         return MaterialUse(city.material_map[name])
@@ -221,7 +221,7 @@ def mitsuba_files(path: Path) -> list[Path]:
     return list(dict.fromkeys([path, *(_mesh_path(reader, shape) for shape in shapes)]))
 
 
-def mitsuba_file(city: scenario.City, path: Path) -> tuple[list[Surface], list[str]]:
+def mitsuba_file(city: settings.City, path: Path) -> tuple[list[Surface], list[str]]:
     """The surfaces of a Mitsuba scene file in world coordinates; lights, cameras and integrators
     are not looked at.
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
-from isac_rt import scenario
 from isac_rt.randomness import splitmix64
+from isac_rt.world import settings
 from isac_rt.world.city.extrude import Finish, building, ground
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface
@@ -17,11 +17,11 @@ def spread_fraction(i: int, j: int) -> float:
     return int(splitmix64(np.zeros(1, np.uint64), np.array([(i << 32) + j], np.uint64))[0]) / 2**64
 
 
-def _height(city: scenario.City, i: int, j: int) -> float:
+def _height(city: settings.City, i: int, j: int) -> float:
     return city.building_height_m + city.height_spread_m * (2 * spread_fraction(i, j) - 1)
 
 
-def _check(city: scenario.City) -> None:
+def _check(city: settings.City) -> None:
     if city.height_spread_m >= city.building_height_m:
         raise CityError(
             f"city.height_spread_m {city.height_spread_m:g} is not below building_height_m "
@@ -31,7 +31,7 @@ def _check(city: scenario.City) -> None:
 
 
 def _blocks(
-    city: scenario.City, boxes: list[tuple[float, float, float, float, float]]
+    city: settings.City, boxes: list[tuple[float, float, float, float, float]]
 ) -> list[Surface]:
     finish = Finish(
         *(MaterialUse(m) for m in (city.wall_material, city.roof_material, city.ground_material))
@@ -44,7 +44,7 @@ def _blocks(
     return [*surfaces, ground(low, high, city.ground_margin_m, 0.0, finish.floor)]
 
 
-def canyon(city: scenario.City) -> list[Surface]:
+def canyon(city: settings.City) -> list[Surface]:
     """A street along y, centred on the origin, its surface at z = 0, with a closed row of buildings
     on each side.
 
@@ -67,7 +67,7 @@ def canyon(city: scenario.City) -> list[Surface]:
     return _blocks(city, boxes)
 
 
-def blocks(city: scenario.City) -> list[Surface]:
+def blocks(city: settings.City) -> list[Surface]:
     """blocks_x by blocks_y square blocks with streets between them, centred on the origin, the
     ground at z = 0."""
     _check(city)

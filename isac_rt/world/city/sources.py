@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from isac_rt import scenario
+from isac_rt.world import settings
 from isac_rt.world.city.materials import CityError, resolve_materials
 from isac_rt.world.city.mesh import CityMesh, Surface, clean, empty_city
 from isac_rt.world.city.meshfiles import mesh_file, mesh_files
@@ -17,7 +17,7 @@ from isac_rt.world.city.mitsuba_xml import builtin_path, mitsuba_file, mitsuba_f
 from isac_rt.world.city.place import Place
 
 
-def _path(city: scenario.City, folder: Path) -> Path:
+def _path(city: settings.City, folder: Path) -> Path:
     if city.source == "builtin":
         if not city.name:
             raise CityError(
@@ -37,7 +37,7 @@ def _path(city: scenario.City, folder: Path) -> Path:
     return path
 
 
-def _terrain(city: scenario.City, folder: Path) -> Path | None:
+def _terrain(city: settings.City, folder: Path) -> Path | None:
     if city.terrain is None:
         return None
     path = folder / city.terrain
@@ -49,7 +49,7 @@ def _terrain(city: scenario.City, folder: Path) -> Path | None:
     return path
 
 
-def city_files(city: scenario.City | None, folder: Path) -> list[Path]:
+def city_files(city: settings.City | None, folder: Path) -> list[Path]:
     """Every file that a city is read from, in an order of their own.
 
     Raises
@@ -68,7 +68,7 @@ def city_files(city: scenario.City | None, folder: Path) -> list[Path]:
 
 
 def _surfaces(
-    city: scenario.City, folder: Path
+    city: settings.City, folder: Path
 ) -> tuple[str, list[Surface], list[str], Place | None]:
     if city.source in ("canyon", "blocks"):  # shapely is loaded for cities that are extruded
         from isac_rt.world.city import parametric
@@ -85,13 +85,13 @@ def _surfaces(
 
 
 def load_city(
-    city: scenario.City | None, folder: Path | str, carrier_frequency: float, centre: ArrayLike
+    city: settings.City | None, folder: Path | str, carrier_frequency: float, centre: ArrayLike
 ) -> CityMesh:
     """The city of a scenario as one float64 mesh about `centre`.
 
     Parameters
     ----------
-    city : scenario.City or None
+    city : settings.City or None
         None: free space, a city without faces.
     folder : path
         Where the scenario file lies; `city.file` is relative to it.

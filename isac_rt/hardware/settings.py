@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from isac_rt.scenario.node import Decibels, Finite, Node, Problem, Vector
+from isac_rt.settings import Decibels, Finite, Node, Problem, Vector
 
 Offset = Annotated[float, Field(ge=1e-3, le=1e12, allow_inf_nan=False)]
 

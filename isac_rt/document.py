@@ -20,7 +20,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from isac_rt.runtime import UserError
-from isac_rt.scenario.node import Key, Node, Problem, dotted
+from isac_rt.settings import Key, Node, Problem, dotted
 
 Tree = typing.TypeVar("Tree", bound=Node)
 
@@ -42,6 +42,10 @@ SCALARS = (
     ),
 )
 """YAML 1.2's plain scalars that are no words: name, pattern, first characters."""
+
+
+class ScenarioWarning(UserWarning):
+    """The scenario can be used, but a value looks as if it were in another unit."""
 
 
 class ScenarioError(UserError):

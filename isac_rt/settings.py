@@ -1,8 +1,9 @@
-"""What every mapping of a scenario is made of: the frozen node, its kinds of numbers, and how it
-complains."""
+"""Frozen, checked settings: the class that every mapping of a scenario extends, its kinds of
+numbers, and its complaints. The settings of a room stand in its `settings.py`."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -57,6 +58,8 @@ class Node(BaseModel):
 
     REMOVED: ClassVar[dict[str, str]] = {}
     """What to write instead of keys ("rays") and values ("model: diffuse") of earlier versions."""
+    KEEPS_NULL: ClassVar[bool] = False
+    """Whether a null that equals the default is written out, since a preset would fill it in."""
 
     @field_validator("*", mode="before")
     @classmethod
@@ -82,3 +85,52 @@ class Node(BaseModel):
     def applies(self, name: str) -> bool:
         """Whether a field means anything beside the values of the others."""
         return True
+
+
+def plain_tree(value: Any) -> Any:
+    """A tree as lists, mappings and numbers, without the keys that have no meaning beside the
+    others. A null that is no more than its default is left out, but where a preset would fill it
+    in."""
+    if isinstance(value, Node):
+        fields, by_preset = type(value).model_fields, type(value).KEEPS_NULL
+        return {
+            name: plain_tree(item)
+            for name, item in value
+            if value.applies(name)
+            and (by_preset or item is not None or fields[name].default is not None)
+        }
+    if isinstance(value, dict):
+        return {name: plain_tree(item) for name, item in value.items()}
+    return [plain_tree(item) for item in value] if isinstance(value, tuple) else value
+
+
+Rising = Annotated[tuple[Finite, ...], Field(min_length=1, max_length=721)]
+
+
+class AspectTable(Node):
+    """Values over a grid of directions in the body's frame."""
+
+    azimuth_deg: Rising
+    """Azimuths of the columns, rising, from the boresight to the right [degrees]. Beyond the first
+    and last the nearest counts; a table that leaves out no more than a step of the circle, such as
+    one from 0 to 350, goes round."""
+    elevation_deg: Rising
+    """Elevations of the rows, rising, from the horizontal upwards [degrees]."""
+    values_db: tuple[tuple[Decibels, ...], ...]
+    """A row for each elevation and in it a number for each azimuth: gain [dBi] or cross-section
+    [dBsm]; between them it is interpolated in decibels."""
+
+    def problems(self) -> Iterator[Problem]:
+        for key, limit in (("azimuth_deg", 360.0), ("elevation_deg", 90.0)):
+            line = getattr(self, key)
+            if any(b <= a for a, b in itertools.pairwise(line)):
+                yield Problem(((key,),), "must rise from each number to the next")
+            if max(map(abs, line)) > limit:
+                yield Problem(((key,),), f"must be within {limit:g} degrees on either side")
+        shape = len(self.elevation_deg), len(self.azimuth_deg)
+        found = len(self.values_db), {len(row) for row in self.values_db}
+        if found != (shape[0], {shape[1]}):
+            yield Problem(
+                (("values_db",),),
+                f"needs {shape[0]} rows (elevations) of {shape[1]} numbers (azimuths)",
+            )

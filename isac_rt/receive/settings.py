@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from isac_rt.scenario.node import Node, Positive, Problem
+from isac_rt.settings import Node, Problem
 
 COUNTS_WITH = {
     "velocity_method": ("clutter_detector", ("cfar",)),
@@ -27,6 +27,7 @@ class Receivers(Node):
         "clutter_detector: map": "clutter_detector: angle_doppler, which uses the same mesh",
         "clutter_detector: sample_matrix": "clutter_detector: angle_doppler in a city, else cfar",
     }
+    KEEPS_NULL: ClassVar[bool] = True
 
     velocity_method: Literal["auto", "omp", "pursuit", "latin_union", "conventional"] = "auto"
     """How velocities are found. `latin_union`: all groups as one uniform sampling, where there are
@@ -177,153 +178,3 @@ class Receivers(Node):
         if own:
             return self.clutter_detector == "angle_doppler"
         return "beams" in (self.symbol_decision, self.passive_detector)
-
-
-class Tracking(Node):
-    """The Kalman filters, and when a track begins and ends."""
-
-    acceleration_std_mps2: Positive = 3.0
-    """Standard deviation of a UAV's acceleration along each axis, held for about a second (Singer's
-    model) [m/s^2]. A higher value follows turns more quickly and smooths less; the default is the
-    limit that PX4 sets for multicopters and covers severe gusts."""
-    gate_probability: Annotated[float, Field(gt=0.5, lt=1)] = 0.999
-    """Probability that a detection of a tracked UAV falls within the gate about its prediction. A
-    higher value loses fewer detections and lets more false ones in; the default loses one in a
-    thousand."""
-    confirm_hits: Annotated[int, Field(ge=1)] = 3
-    """Detections within `confirm_window` frames that confirm a track. Three of five, the default,
-    let hardly any false alarm become a track."""
-    confirm_window: Annotated[int, Field(ge=1)] = 5
-    """Frames within which `confirm_hits` detections must fall to confirm a track; more of them
-    confirm weak targets too, and more false ones. The default is the usual three of five."""
-    drop_misses: Annotated[int, Field(ge=1)] = 8
-    """Frames without a detection in a row after which a confirmed track ends. The default bridges
-    short shadows."""
-    drop_after_s: Positive | None = None
-    """Time without a detection after which a confirmed track ends, whatever `drop_misses` says [s];
-    one that was seen for less long ends after as many frames as it was seen in. null, the default:
-    only `drop_misses` counts."""
-    births: Literal["all", "unexplained"] = "all"
-    """Detections that start tracks. `all`, the default. `unexplained`: not those where the city's
-    mesh shows the terminal itself, or a passive one its transmitter, by one or two walls, nor those
-    at the edge of the view, nor those on a face of the mesh, nor those that stand still beside each
-    other as a building does that the mesh lacks. A track is confirmed only if two of its detections
-    could have started one, and not if it lies in a face or behind a wall, or is a wall's image of a
-    nearer one, or of a nearer body that others told of (`cooperation`). One that fits such an
-    image, or lies behind a wall, in three frames in a row ends. Two confirmed ones within 0.5 m of
-    which no frame shows both are one. With `cooperation` a passive terminal confirms none before
-    its sixth frame: until then the active one cannot have told it what flies near its line of
-    sight."""
-    mirrors: Literal["ignore", "place"] = "ignore"
-    """What becomes of a track behind a wall of the mesh, with `births: unexplained`, at an active
-    terminal. `ignore`, the default: it is not confirmed. `place`: if it moves, is no echo of a
-    nearer track over a wall and the wall can show the place, it is taken for the image of a UAV out
-    of sight, and reported where that UAV is."""
-
-    @property
-    def needs_mesh(self) -> bool:
-        """Whether births are held against a city's mesh."""
-        return self.births == "unexplained"
-
-    def problems(self) -> Iterator[Problem]:
-        if self.confirm_hits > self.confirm_window:
-            yield Problem(
-                (("confirm_hits",), ("confirm_window",)),
-                f"{self.confirm_hits} hits cannot be reached within confirm_window = "
-                f"{self.confirm_window}; lower it or widen the window",
-            )
-        if self.mirrors == "place" and self.births == "all":
-            yield Problem(
-                (("mirrors",), ("births",)),
-                "place has no meaning with births all, only with unexplained; leave it out, or "
-                "change births",
-            )
-
-
-PLAIN: dict[str, dict[str, Any]] = {
-    "receivers": {
-        "velocity_method": "auto",
-        "refinement": "local",
-        "symbol_decision": "powers",
-        "separate_reference": False,
-        "link_acquisition": "pilots",
-        "passive_detector": "cfar",
-        "clutter_filter": "none",
-        "clutter_detector": "cfar",
-        "false_alarm_rate": 1e-6,
-        "update_false_alarm_rate": None,
-        "gate_false_alarm_rate": None,
-    },
-    "tracking": {"drop_after_s": None, "births": "all", "mirrors": "ignore"},
-}
-PRESETS: dict[str, dict[str, dict[str, Any]]] = {
-    "paper": {
-        "receivers": {
-            **PLAIN["receivers"],
-            "velocity_method": "omp",
-            "refinement": "grid",
-            "clutter_filter": "runs",
-        },
-        "tracking": PLAIN["tracking"],
-    },
-    "plain": PLAIN,
-    "city": {
-        "receivers": {
-            **PLAIN["receivers"],
-            "symbol_decision": "beams",
-            "separate_reference": True,
-            "link_acquisition": "blind",
-            "passive_detector": "beams",
-            "clutter_detector": "angle_doppler",
-            "update_false_alarm_rate": 1e-4,
-            "gate_false_alarm_rate": 1e-3,
-        },
-        "tracking": {"drop_after_s": 0.36, "births": "unexplained", "mirrors": "ignore"},
-    },
-}
-"""What each preset says of `receivers` and `tracking`, all of them of the same keys; of the rest
-they say nothing."""
-Preset = Literal["paper", "plain", "city"]
-
-
-class ReceiverSet(Node):
-    """Receivers and trackers that hear the same samples as the scenario's own. They listen only:
-    nothing that is sent depends on them."""
-
-    preset: Preset | None = None
-    """Settings by name, which the keys stated beside it override. null, the default: none; what is
-    not stated is as in the scenario's own `receivers` and `tracking`."""
-    receivers: Receivers = Receivers()
-    """How its terminals detect targets and decode data. What is left out is as the preset says, or
-    as by default."""
-    tracking: Tracking = Tracking()
-    """Its Kalman filters, and when a track begins and ends. What is left out is as the preset says,
-    or as by default."""
-
-
-def with_preset(stated: dict[str, Any], named: Any, own: dict[str, Any]) -> dict[str, Any]:
-    """What a file states of a set of receivers, with what the preset `named` says and `own`
-    settings say of the rest. What is malformed stays as it is, for whoever checks it."""
-    said = PRESETS.get(named, {}) if isinstance(named, str) else {}
-    out = dict(stated)
-    for key in ("receivers", "tracking"):
-        mine = stated.get(key, {})
-        if isinstance(mine, dict):
-            parts = [p for p in (own.get(key), said.get(key)) if isinstance(p, dict)]
-            filled = {k: v for part in parts for k, v in part.items()} | mine
-            out[key] = filled if key == "tracking" else _without_idle(filled, mine)
-    return out
-
-
-def _without_idle(filled: dict[str, Any], stated: dict[str, Any]) -> dict[str, Any]:
-    """Settings of receivers without those that nobody stated and that have no meaning beside what
-    was."""
-    idle = {
-        key
-        for key, (other, values) in COUNTS_WITH.items()
-        if other in stated and stated[other] not in values
-    }
-    start, usual = filled.get("false_alarm_rate"), filled.get("update_false_alarm_rate")
-    if isinstance(start, int | float) and isinstance(usual, int | float) and usual < start:
-        idle.add("update_false_alarm_rate")
-    return {k: v for k, v in filled.items() if k in stated or k not in idle}

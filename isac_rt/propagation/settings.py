@@ -1,0 +1,155 @@
+"""What a scenario says about the city, the paths in it, its clutter, and how near to the full model
+a run has to come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from isac_rt.settings import Decibels, Loss, Node, Positive, Problem
+
+
+class Leakage(Node):
+    """What a terminal's receiver hears of its own transmitter on the same body."""
+
+    enabled: bool = True
+    """Whether leakage is simulated, with `propagation.model: ray_traced`. On by default, for no
+    radar is without it."""
+    isolation_db: Loss = 60.0
+    """Loss from the transmit to the receive antennas of one body [dB]. The default is that of
+    separate antennas on one board."""
+    delay_s: Annotated[float, Field(ge=0)] = 1e-9
+    """Delay of the leakage [s]. The default is 30 cm of way."""
+
+
+class Propagation(Node):
+    """Which paths there are between the terminals and by way of the targets."""
+
+    model: Literal["free_space", "ray_traced"] = "free_space"
+    """How paths are found: `free_space`, the default and the paper's, has lines of sight and echoes
+    only; `ray_traced` finds reflections, ghosts and shadows in the city's mesh."""
+    max_bounces: Annotated[int, Field(ge=0, le=6)] = 2
+    """Most mirror reflections on a path between two terminals, and on the ways to and from a target
+    together. More reflections cost time and add weaker paths; the default finds single and double
+    ones."""
+    rays: Annotated[int, Field(ge=100, le=10_000_000)] = 60_000
+    """Rays that a terminal sends out at each knot of its flight to find which walls a wave may meet
+    one after the other; five knots are pooled (`accuracy.max_untraced_m` says how far apart they
+    are). More rays find paths over small faces more surely and take longer. Paths that are found do
+    not depend on it. The default misses none over the noise of a cell in cities of some hundred
+    metres."""
+    ghosts: bool = True
+    """Whether echoes of a target that also bounce off the city are simulated; a receiver takes them
+    for targets. On by default, as in any street."""
+    specular: bool = True
+    """Whether mirror reflections off the city are simulated. On by default, as in any street."""
+    weakest_path_db: Loss = 40.0
+    """How far below the noise of one range-Doppler-antenna cell paths must be to be left out [dB].
+    The default leaves out a ten-thousandth of the noise; a smaller value is faster."""
+    leakage: Leakage = Leakage()
+    """What a terminal's receiver hears of its own transmitter; it covers what is very near. The
+    default is that of a board with separate antennas."""
+
+
+class Clutter(Node):
+    """What is received beside lines of sight, targets, ghosts and mirror images."""
+
+    model: Literal["none", "gaussian", "rayleigh", "diffuse", "field"] = "none"
+    """Kind of clutter. `none`, the default; with `noise.model: snr` it is the paper's "Gaussian
+    noise environment". `gaussian`: white noise beside the thermal noise. `rayleigh`, the paper's
+    urban model: a run of range cells that stand still. `field`: scatterers pinned to the city's
+    mesh, the same in all frames and links. `diffuse`: Sionna RT's own diffuse paths, drawn anew in
+    every frame, to compare with."""
+    clutter_to_noise_db: Decibels = 0.0
+    """Power of `gaussian` clutter over that of the thermal noise [dB]. By default they are
+    alike."""
+    level_db: Decibels = 10.0
+    """Mean level of one cell of `rayleigh` clutter over the reference path of the link [dB]: the
+    strongest target at an active terminal, the line of sight at a passive one, as if nothing hid
+    it. The default is the paper's."""
+    level_of: Literal["power", "amplitude"] = "power"
+    """Whether `level_db` of `rayleigh` clutter is that of the mean power, the default, or of the
+    mean amplitude, which is 1.05 dB more of power."""
+    cells: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (40, 50)
+    """Least and most consecutive range cells of `rayleigh` clutter; the number is drawn in between.
+    The default is the paper's."""
+    centre: Literal["drawn", "reference"] = "drawn"
+    """Where the middle of `rayleigh` clutter lies: `drawn` uniformly within `centre_m`, the
+    default, or at the range of the `reference` path."""
+    centre_m: tuple[Positive, Positive] = (20.0, 30.0)
+    """Least and greatest range of the middle of `rayleigh` clutter that is drawn [m], twice the
+    same to fix it; one way at an active terminal, path length at a passive one. The default is the
+    paper's."""
+    place: Literal["drawn", "grid"] = "drawn"
+    """Where a scatterer of `rayleigh` clutter lies: `drawn` anywhere in its range cell, the
+    default, or in its middle (`grid`)."""
+    direction: Literal["field_of_view", "reference"] = "field_of_view"
+    """Directions of `rayleigh` clutter: drawn over the `field_of_view` of both ends, the default,
+    or all that of the `reference` path."""
+    cell_correlation: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Correlation of the complex amplitudes of neighbouring cells of `rayleigh` clutter, from 0 to
+    1. By default cells are independent."""
+    redraw: Literal["each_frame", "once"] = "each_frame"
+    """How often `rayleigh` clutter is drawn: in `each_frame`, the default, or `once` for the
+    run."""
+    rays: Annotated[int, Field(ge=100, le=10_000_000)] = 20_000
+    """Rays that a transmitter sends out for `diffuse` clutter. More rays give more and weaker
+    paths, the same power in all, and take longer. The default gives some thousand paths a link."""
+    max_error_db: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] = 0.2
+    """Error that nine of ten cells keep to [dB], for `field`: of the mean clutter power in a range
+    cell of 4 m, and of noise plus mean clutter in a range-Doppler cell, under whose noise
+    scatterers are merged. A smaller error takes more scatterers. The default is far below the
+    fluctuation of clutter itself."""
+    cell_area_per_metre_m: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
+    """Largest area that one scatterer stands for, per metre of distance to the nearest terminal's
+    flight [m^2/m], for `field`. null, the default: what `max_error_db` asks for."""
+    smallest_cell_m2: Annotated[float, Field(ge=1e-4, le=1e4, allow_inf_nan=False)] = 0.05
+    """Area of a surface cell that is cut no further, however near a terminal flies [m^2], for
+    `field`. The default bounds the number of scatterers beside a wall."""
+    mirrors: Annotated[int, Field(ge=0, le=64)] = 0
+    """Walls, roofs and grounds per terminal, the strongest, by way of which each scatterer is lit
+    and heard as well, for `field`. 0, the default: clutter of one bounce only."""
+
+    @property
+    def noise_rise(self) -> float:
+        """Power of thermal noise and `gaussian` clutter together over that of the thermal noise:
+        the sum of two white Gaussian processes is one."""
+        return 1 + 10 ** (self.clutter_to_noise_db / 10) if self.model == "gaussian" else 1.0
+
+    def applies(self, name: str) -> bool:
+        if name == "centre_m" and self.centre != "drawn":
+            return False
+        return name == "model" or name in CLUTTER_KEYS[self.model]
+
+    def problems(self) -> Iterator[Problem]:
+        for name, (low, high) in (("cells", self.cells), ("centre_m", self.centre_m)):
+            if low > high:
+                yield Problem(
+                    ((name,),),
+                    f"the first number must not exceed the second; write [{high:g}, {low:g}]",
+                )
+
+
+CLUTTER_KEYS: dict[str, frozenset[str]] = {
+    "none": frozenset(),
+    "gaussian": frozenset({"clutter_to_noise_db"}),
+    "rayleigh": frozenset(
+        {
+            "level_db",
+            "level_of",
+            "cells",
+            "centre",
+            "centre_m",
+            "place",
+            "direction",
+            "cell_correlation",
+            "redraw",
+        }
+    ),
+    "diffuse": frozenset({"rays"}),
+    "field": frozenset({"max_error_db", "cell_area_per_metre_m", "smallest_cell_m2", "mirrors"}),
+}
+"""Keys that each clutter model understands, beside model; the others may stand and are not written
+back."""

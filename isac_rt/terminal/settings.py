@@ -1,0 +1,111 @@
+"""Settings of the trackers, and of what terminals believe wrongly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, Field
+
+from isac_rt.settings import Decibels, Finite, Node, Positive, Problem, Vector
+
+
+class Tracking(Node):
+    """The Kalman filters, and when a track begins and ends."""
+
+    KEEPS_NULL: ClassVar[bool] = True
+
+    acceleration_std_mps2: Positive = 3.0
+    """Standard deviation of a UAV's acceleration along each axis, held for about a second (Singer's
+    model) [m/s^2]. A higher value follows turns more quickly and smooths less; the default is the
+    limit that PX4 sets for multicopters and covers severe gusts."""
+    gate_probability: Annotated[float, Field(gt=0.5, lt=1)] = 0.999
+    """Probability that a detection of a tracked UAV falls within the gate about its prediction. A
+    higher value loses fewer detections and lets more false ones in; the default loses one in a
+    thousand."""
+    confirm_hits: Annotated[int, Field(ge=1)] = 3
+    """Detections within `confirm_window` frames that confirm a track. Three of five, the default,
+    let hardly any false alarm become a track."""
+    confirm_window: Annotated[int, Field(ge=1)] = 5
+    """Frames within which `confirm_hits` detections must fall to confirm a track; more of them
+    confirm weak targets too, and more false ones. The default is the usual three of five."""
+    drop_misses: Annotated[int, Field(ge=1)] = 8
+    """Frames without a detection in a row after which a confirmed track ends. The default bridges
+    short shadows."""
+    drop_after_s: Positive | None = None
+    """Time without a detection after which a confirmed track ends, whatever `drop_misses` says [s];
+    one that was seen for less long ends after as many frames as it was seen in. null, the default:
+    only `drop_misses` counts."""
+    births: Literal["all", "unexplained"] = "all"
+    """Detections that start tracks. `all`, the default. `unexplained`: not those where the city's
+    mesh shows the terminal itself, or a passive one its transmitter, by one or two walls, nor those
+    at the edge of the view, nor those on a face of the mesh, nor those that stand still beside each
+    other as a building does that the mesh lacks. A track is confirmed only if two of its detections
+    could have started one, and not if it lies in a face or behind a wall, or is a wall's image of a
+    nearer one, or of a nearer body that others told of (`cooperation`). One that fits such an
+    image, or lies behind a wall, in three frames in a row ends. Two confirmed ones within 0.5 m of
+    which no frame shows both are one. With `cooperation` a passive terminal confirms none before
+    its sixth frame: until then the active one cannot have told it what flies near its line of
+    sight."""
+    mirrors: Literal["ignore", "place"] = "ignore"
+    """What becomes of a track behind a wall of the mesh, with `births: unexplained`, at an active
+    terminal. `ignore`, the default: it is not confirmed. `place`: if it moves, is no echo of a
+    nearer track over a wall and the wall can show the place, it is taken for the image of a UAV out
+    of sight, and reported where that UAV is."""
+
+    @property
+    def needs_mesh(self) -> bool:
+        """Whether births are held against a city's mesh."""
+        return self.births == "unexplained"
+
+    def problems(self) -> Iterator[Problem]:
+        if self.confirm_hits > self.confirm_window:
+            yield Problem(
+                (("confirm_hits",), ("confirm_window",)),
+                f"{self.confirm_hits} hits cannot be reached within confirm_window = "
+                f"{self.confirm_window}; lower it or widen the window",
+            )
+        if self.mirrors == "place" and self.births == "all":
+            yield Problem(
+                (("mirrors",), ("births",)),
+                "place has no meaning with births all, only with unexplained; leave it out, or "
+                "change births",
+            )
+
+
+def _four_numbers(value: Any) -> Any:
+    if (
+        not isinstance(value, list | tuple)
+        or len(value) != 4
+        or not all(isinstance(v, int | float) for v in value)
+    ):
+        raise ValueError("must be four numbers [x_min, y_min, x_max, y_max]")
+    if value[0] >= value[2] or value[1] >= value[3]:
+        raise ValueError("holds nothing; state [x_min, y_min, x_max, y_max] in this order")
+    return value
+
+
+Rectangle = Annotated[tuple[Finite, Finite, Finite, Finite], BeforeValidator(_four_numbers)]
+
+
+class Belief(Node):
+    """What terminals believe wrongly of themselves and of the city, to see what it costs them. What
+    is sent, and what returns, is as it truly is."""
+
+    missing_m: tuple[Rectangle, ...] = ()
+    """Rectangles [x_min, y_min, x_max, y_max] on the ground whose buildings are missing in the
+    terminals' mesh [m]: all faces that lie wholly within one. By default none."""
+    position_m: Vector = (0.0, 0.0, 0.0)
+    """Error of the position that each terminal believes to be at: east, north, up [m]. By default
+    none."""
+    velocity_mps: Vector = (0.0, 0.0, 0.0)
+    """Error of the velocity that each terminal believes to have: east, north, up [m/s]. By default
+    none."""
+    attitude_deg: Vector = (0.0, 0.0, 0.0)
+    """Turn of the attitude that each terminal believes to have, about the axes east, north and up
+    [deg]. By default none."""
+    level_db: Decibels = 0.0
+    """Error of the clutter's level that terminals expect [dB]. By default none."""
+    mesh_m: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
+    """Standard deviation of the error of each face of the terminals' mesh along its normal [m], for
+    the clutter that they expect. By default none."""
