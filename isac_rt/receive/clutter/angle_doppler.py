@@ -42,8 +42,8 @@ from isac_rt.receive.estimate import OFF_GRID, Estimate, Estimator, LocalSpectra
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import UNION_FLOOR, accumulate, maps_with_power
 from isac_rt.receive.sense import Sensed, describe
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Correction, ExpectedClutter, Gates
-from isac_rt.scenario.receivers import Receivers
 
 LEAST = 0.03
 """Cells whose expected clutter is less than this share of the noise are taken to hold noise
