@@ -112,7 +112,6 @@ TESTS_OF = {
     "receive/joint/neighbours.py": "test_receive_joint",
     "receive/symbols/beams.py": "test_receive_beams",
     "receive/pursuit.py": "test_receive_pursuit",
-    "receive/symbols/profile.py": "test_profile_decision",
     "receive/clutter/adaptive.py": "test_clutter_detectors",
     "receive/clutter/correction.py": "test_clutter_fit",
     "receive/clutter/power.py": "test_clutter_detectors",

@@ -23,7 +23,6 @@ from isac_rt.receive.sense import Cfar, Detector
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.symbols.beams import ByBeams
 from isac_rt.receive.symbols.powers import ByPowers
-from isac_rt.receive.symbols.profile import ByProfile
 from isac_rt.receive.types import Detections
 
 Refiner = Callable[[Moments, Detections], tuple[Detections, np.ndarray]]
@@ -43,7 +42,7 @@ CFARS: dict[str, Callable[[Receivers, Estimator], Cfar]] = {
 }
 ESTIMATORS = {"grid": Estimator(on_grid=True), "local": Estimator(), "joint": Estimator()}
 REFINERS: dict[str, Refiner | None] = {"grid": None, "local": None, "joint": refine_jointly}
-READERS = {"powers": ByPowers, "profile": ByProfile, "beams": ByBeams}
+READERS = {"powers": ByPowers, "beams": ByBeams}
 
 
 def filter_of(settings: Receivers) -> ClutterFilter | None:

@@ -87,16 +87,14 @@ class PassiveReceiver:
         cube: IFCube,
         prediction: Prediction | None,
         modulated: bool,
-        profile: np.ndarray | None = None,
         clutter: ExpectedClutter | None = None,
         *,
         maps: bool = False,
     ) -> Reception:
-        """See `receive_passive`; `profile` is what the reader learned last, `clutter` what the
-        terminal expects of its mesh."""
+        """See `receive_passive`; `clutter` is what the terminal expects of its mesh."""
         if self.groups is not None and modulated:
             part, every = cube.of_groups(self.groups), replace(self, groups=None)
-            mine = every.receive(part, prediction, True, profile, clutter, maps=maps)
+            mine = every.receive(part, prediction, True, clutter, maps=maps)
             return _among_all(mine, self.groups, cube.waveform)
         w = cube.waveform
         if not modulated:
@@ -110,7 +108,7 @@ class PassiveReceiver:
             return self._reception(cube, moments, found, detections, reference, maps=maps)
         symbols = None
         if prediction is not None:
-            symbols = self.reader.read(cube, prediction, self.antennas, profile)
+            symbols = self.reader.read(cube, prediction, self.antennas)
         if prediction is None or symbols is None or not self._believed(symbols, w):
             power = np.zeros((w.num_range_cells, w.num_chirps))
             picture = make_maps(power, cube, self.settings, 1) if maps else None
@@ -144,7 +142,6 @@ class PassiveReceiver:
         self,
         cube: IFCube,
         path: Prediction,
-        profile: np.ndarray | None = None,
         clutter: ExpectedClutter | None = None,
         *,
         maps: bool = False,
@@ -153,10 +150,10 @@ class PassiveReceiver:
         its reference the earliest detection. Otherwise as `receive`."""
         if self.groups is not None:
             part, every = cube.of_groups(self.groups), replace(self, groups=None)
-            mine = every.receive_over(part, path, profile, clutter, maps=maps)
+            mine = every.receive_over(part, path, clutter, maps=maps)
             return _among_all(mine, self.groups, cube.waveform)
         w = cube.waveform
-        symbols = self.reader.read(cube, path, self.antennas, profile)
+        symbols = self.reader.read(cube, path, self.antennas)
         if not self._believed(symbols, w):
             return Reception.undecoded(w, no_detections())
         read = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
@@ -168,15 +165,6 @@ class PassiveReceiver:
         detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))
         reception = self._reception(cube, moments, found, detections, reference, maps=maps)
         return _decoded(reception, symbols)
-
-    def learn(
-        self, cube: IFCube, detections: Detections, reception: Reception
-    ) -> np.ndarray | None:
-        """What the reader remembers of a frame; `detections` as in the samples."""
-        if not reception.decoded:
-            return self.reader.learn(cube, detections)
-        mine = cube if self.groups is None else cube.of_groups(self.groups)
-        return self.reader.learn(mine, detections, reception.raw_delay_symbols)
 
     def peaks(self, cube: IFCube, time: float, modulated: bool) -> Peaks:
         """What is kept of a frame that could not be read, `time` its middle [s]."""
@@ -347,9 +335,7 @@ def receive_passive(
     Reception; in an unmodulated frame the reference is the earliest detection within 20 dB of the
     strongest. Without a prediction a modulated frame cannot be read: nothing is detected. When the
     decisions look like noise or like a path that moves otherwise, or nothing is found where the
-    reference is expected, `line_of_sight` is False and all symbols are erased. With
-    ``symbol_decision: profile`` the delay symbols are decided as by powers: what a terminal learned
-    from an unmodulated frame is `PassiveReceiver.receive`'s to know.
+    reference is expected, `line_of_sight` is False and all symbols are erased.
 
     Examples
     --------

@@ -26,6 +26,7 @@ class Receivers(Node):
         "clutter_channels": "leave it out; clutter_detector: angle_doppler filters all antennas",
         "clutter_detector: map": "clutter_detector: angle_doppler, which uses the same mesh",
         "clutter_detector: sample_matrix": "clutter_detector: angle_doppler in a city, else cfar",
+        "symbol_decision: profile": "symbol_decision: beams, which is the most sensitive",
     }
     KEEPS_NULL: ClassVar[bool] = True
 
@@ -42,12 +43,10 @@ class Receivers(Node):
     paper's. `local`, the default: maximum likelihood about each peak, at little cost. `joint`: all
     paths at once on the samples, which reaches the Cramer-Rao bound and separates paths in one cell
     by direction, but is slower."""
-    symbol_decision: Literal["powers", "profile", "beams"] = "powers"
+    symbol_decision: Literal["powers", "beams"] = "powers"
     """How a passive terminal reads symbols. `powers`, the default and the paper's: the powers of
-    the receive antennas are added. `profile`: delay symbols by correlation with the range profile
-    of the last frame that was read or held no data, in which clutter counts too. `beams`: the
-    antennas are added in phase towards the tracked paths, with a log-likelihood ratio for every
-    bit; the most sensitive."""
+    the receive antennas are added. `beams`: the antennas are added in phase towards the tracked
+    paths, with a log-likelihood ratio for every bit; the most sensitive."""
     separate_reference: bool = False
     """Whether a passive terminal tells its line of sight apart from a wall's or the ground's
     reflection in the same cell, by direction, before it believes its range. Costs time only in

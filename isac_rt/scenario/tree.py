@@ -333,7 +333,7 @@ class Scenario(Node):
             "clutter_detector": ("cfar",),
             "passive_detector": ("cfar",),
             "refinement": ("local", "grid"),
-            "symbol_decision": ("powers", "profile"),
+            "symbol_decision": ("powers",),
             "link_acquisition": ("pilots",),
         }
         for at, receivers in self._all_receivers().items():

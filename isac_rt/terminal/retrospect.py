@@ -71,7 +71,6 @@ class Retrospect:
         self,
         cube: IFCube,
         time: float,
-        profile: np.ndarray | None,
         clutter: ExpectedClutter | None,
         *,
         maps: bool,
@@ -79,13 +78,13 @@ class Retrospect:
         """A data frame that the line of sight does not read, over the path that is known or that it
         makes known; None where there is none yet."""
         if self.path is not None:
-            out = self._over(cube, time, profile, clutter, maps=maps)
+            out = self._over(cube, time, clutter, maps=maps)
             if out is not None:
                 return out
         self.path = self._learn(cube, time, True)
         if self.path is None:
             return None
-        return self._over(cube, time, profile, clutter, maps=maps)
+        return self._over(cube, time, clutter, maps=maps)
 
     def look(self, cube: IFCube, time: float) -> None:
         """A frame without data, which tells the whole cells of those that wait."""
@@ -142,7 +141,6 @@ class Retrospect:
         self,
         cube: IFCube,
         time: float,
-        profile: np.ndarray | None,
         clutter: ExpectedClutter | None,
         *,
         maps: bool,
@@ -153,7 +151,7 @@ class Retrospect:
         expected = self.path.prediction
         if expected.range_std[0] > COAST_CELLS * self._cells[0]:
             return None
-        out = self._receiver.receive_over(cube, expected, profile, clutter, maps=maps)
+        out = self._receiver.receive_over(cube, expected, clutter, maps=maps)
         if not out.decoded:
             return None
         d = out.detections

@@ -304,7 +304,6 @@ class PassiveTerminal:
         self.slips_repaired = 0
         self.calibration = calibration_of(receivers, waveform, antennas, 1)
         self._ends: deque[np.ndarray] = deque(maxlen=EVIDENCE_FRAMES)
-        self._profile: np.ndarray | None = None
         self._clutter: ExpectedClutter | None = None
         self._teller: Track | None = None
         self._word: Track | None = None
@@ -371,10 +370,6 @@ class PassiveTerminal:
         if modulated:
             self._read = reception.decoded
         self._follow(reception, own_pose, anchored)
-        believed = self.reference is not None and self.reference.missed == 0
-        if reception.line_of_sight and (believed or not modulated):
-            heard = self._late(reception.detections, 1)
-            self._profile = self._receiver.learn(cube, heard, reception)
         sight = self.reference if reception.line_of_sight else self._teller
         seen = reception.line_of_sight or reception.decoded
         if sight is not None and seen and reception.placed:
@@ -415,7 +410,7 @@ class PassiveTerminal:
             kept.forget()
         if anchored or reception.decoded:
             return reception, anchored
-        out = kept.read(cube, time, self._profile, self._clutter, maps=maps)
+        out = kept.read(cube, time, self._clutter, maps=maps)
         if out is None:
             return reception, False
         out = replace(out, detections=self._late(out.detections, -1))
@@ -494,7 +489,6 @@ class PassiveTerminal:
             "reference": None if self.reference is None else self.reference.memory(),
             "slips_repaired": self.slips_repaired,
             "ends": list(self._ends),
-            "profile": self._profile,
             "read": self._read,
             "standing": self._standing.memory(),
             "calibration": None if self.calibration is None else self.calibration.memory(),
@@ -508,7 +502,7 @@ class PassiveTerminal:
         reference = memory["reference"]
         self.reference = None if reference is None else Track.of_memory(reference)
         self._time, self.state = memory["time"], TerminalState(memory["state"])
-        self.slips_repaired, self._profile = memory["slips_repaired"], memory["profile"]
+        self.slips_repaired = memory["slips_repaired"]
         self._read = memory["read"]
         self._ends = deque(memory["ends"], maxlen=EVIDENCE_FRAMES)
         if self.calibration is not None:
@@ -530,8 +524,7 @@ class PassiveTerminal:
         `other`, which is given the same."""
         if self.other is not None:
             return self.other.receive(cube, prediction, modulated, maps)
-        known = self._profile, self._clutter
-        return self._receiver.receive(cube, prediction, modulated, *known, maps=maps)
+        return self._receiver.receive(cube, prediction, modulated, self._clutter, maps=maps)
 
     @property
     def _clock(self) -> np.ndarray:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import product
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -333,27 +332,6 @@ def test_reflectors_are_tracked_by_way_of_the_sender_while_it_is_in_sight():
     assert tracks.mean[1, :3] + OWN.position == pytest.approx(BODY[:3], abs=0.5)
     _, tracks = pt.step(EMPTY, OWN, 0.001, False)
     assert tracks.age.tolist() == [2, 0] and len(pt.tracker.tracks) == 1
-
-
-def test_what_was_learned_last_goes_to_the_receiver():
-    """A frame with a line of sight teaches the reader, with data or without; one without a line of
-    sight teaches nothing, and what was learned before stays. Planted bugs: nothing kept; learned
-    from every frame."""
-    pt = PassiveTerminal(W, STEERED, Receivers(), Tracking(), 8, AMPLITUDE)
-    answers = [heard(sight()), heard(), heard(sight(0.04)), heard(), heard(sight(0.08))]
-    given, lessons = [], iter(["first", "second", "third"])
-
-    def receive(cube, prediction, modulated, profile, clutter, *, maps):
-        given.append(profile)
-        return answers[len(given) - 1]
-
-    def learn(cube, detections, reception):
-        return next(lessons)
-
-    vars(pt)["_receiver"] = SimpleNamespace(receive=receive, learn=learn)
-    for k, modulated in enumerate((False, False, True, False, True)):
-        pt.step(EMPTY, OWN, 0.02 * k, modulated)
-    assert given == [None, "first", "first", "second", "second"]
 
 
 def outside(*symbols: int) -> np.ndarray:

@@ -143,15 +143,9 @@ class ByBeams(ByPowers):
     """Receivers added in phase towards the tracked paths; in power where the reference has no
     direction."""
 
-    def read(
-        self,
-        cube: IFCube,
-        prediction: Prediction,
-        antennas: Antennas,
-        profile: np.ndarray | None = None,
-    ) -> Symbols:
+    def read(self, cube: IFCube, prediction: Prediction, antennas: Antennas) -> Symbols:
         if not usable_paths(prediction).size:
-            return super().read(cube, prediction, antennas, profile)
+            return super().read(cube, prediction, antennas)
         return demodulate_beams(cube, prediction, antennas, self.order, self.run_cells)
 
 

@@ -8,7 +8,6 @@ where such a slip shows.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -23,7 +22,7 @@ from isac_rt.kernels.vector import new_memory
 from isac_rt.receive.clutter.filter import runs
 from isac_rt.receive.spectrum import tones
 from isac_rt.receive.transform import transform
-from isac_rt.receive.types import Detections, Prediction
+from isac_rt.receive.types import Prediction
 
 EXTRA_CELLS = 4
 WEAKEST_WEIGHT = 0.05  # predicted paths below this share of the strongest do not vote on the symbol
@@ -31,12 +30,6 @@ WEAKEST_WEIGHT = 0.05  # predicted paths below this share of the strongest do no
 GATHERED = 0.6
 """Share of the spread of phases that lie anywhere, below which the spread of transitions about
 their symbols is their error: wrapping hides a tenth of it at most."""
-
-Decision = Callable[
-    [np.ndarray, list[tuple[float, np.ndarray]], Waveform], tuple[np.ndarray, np.ndarray]
-]
-"""From the power (P, N) of derotated chirps, and the weights and cells (P,) of the paths that vote
-besides, to symbols and their confidences (P,)."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +80,6 @@ def demodulate(
     prediction: Prediction,
     dpsk_order: int,
     run_cells: int | None = None,
-    decision: Decision | None = None,
 ) -> Symbols:
     """Decide all symbols of a frame.
 
@@ -98,7 +90,6 @@ def demodulate(
     dpsk_order : D
     run_cells : leave runs of so many occupied cells out of the decision
         (`isac_rt.receive.clutter.filter`); None: do not look
-    decision : of the delay symbols from derotated power, None: `decide`
     """
     w = cube.waveform
     delays, rates = prediction.range / SPEED_OF_LIGHT, prediction.velocity / SPEED_OF_LIGHT
@@ -123,7 +114,7 @@ def demodulate(
         transform(cube.samples[m], turn, cells, spectra, power=power, tapered=wanted)
         if run_cells is not None:
             power[runs(tapered / len(spectra), len(spectra), run_cells)] = 0
-        raw[m], sure[m] = (decision or decide)(power, [(g, o[m]) for g, o in others], w)
+        raw[m], sure[m] = decide(power, [(g, o[m]) for g, o in others], w)
         picked[m] = spectra[:, raw[m] - cells[0], np.arange(shape[1])]
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)
     known = known_cycles(w, delays[0], rates[0], raw)
@@ -155,22 +146,9 @@ class ByPowers:
     order: int
     run_cells: int | None = None
 
-    def read(
-        self,
-        cube: IFCube,
-        prediction: Prediction,
-        antennas: Antennas,
-        profile: np.ndarray | None = None,
-    ) -> Symbols:
-        """The symbols of a modulated frame; `profile` is what `learn` has found last."""
+    def read(self, cube: IFCube, prediction: Prediction, antennas: Antennas) -> Symbols:
+        """The symbols of a modulated frame."""
         return demodulate(cube, prediction, self.order, self.run_cells)
-
-    def learn(
-        self, cube: IFCube, detections: Detections, symbols: np.ndarray | None = None
-    ) -> np.ndarray | None:
-        """What the reader remembers of a frame with its reference, whose delay symbols (M, P) it
-        has read; None: without data."""
-        return None
 
 
 def known_cycles(

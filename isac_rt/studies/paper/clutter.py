@@ -37,7 +37,6 @@ from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import decide, decide_transitions, known_cycles
-from isac_rt.receive.symbols.profile import correlate, learn_profile
 from isac_rt.signal.if_signal import add_noise, if_signal
 from isac_rt.signal.methods import Auto
 from isac_rt.studies.paper import clutter_statistics as numbers
@@ -51,6 +50,7 @@ from isac_rt.studies.paper.outcome import (
     proportion,
     table,
 )
+from isac_rt.studies.paper.range_profile import correlate, learn_profile
 from isac_rt.studies.paper.symbols import make_cells
 from isac_rt.studies.waves import AT_TO_PT, prediction, sender, waves
 from isac_rt.world.swarm import Pose

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
 
-from isac_rt.frame.payload import random_payload, unmodulated
+from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive.symbols.powers import confidence_threshold
-from isac_rt.receive.symbols.profile import ByProfile, correlate, learn_profile
-from isac_rt.receive.types import Detections, Prediction
+from isac_rt.receive.symbols.powers import decide
+from isac_rt.receive.types import Prediction
+from isac_rt.studies.paper.range_profile import correlate, derotation, learn_profile
 
 SHORT = Waveform(num_samples=256, num_chirps=60)
 
@@ -50,58 +50,15 @@ def test_the_profile_reads_what_the_strongest_cell_does_not(snr_db: float):
     paths, expected = scene(5)
     noise = 10 ** (-snr_db / 10)
     profile = learn_profile(cube(w, schedule, unmodulated(w), paths, ANTENNAS, noise, 1), expected)
-    received = cube(w, schedule, payload, paths, ANTENNAS, noise, 2)
-    plain = ByProfile(8).read(received, expected, ANTENNAS)
-    read = ByProfile(8).read(received, expected, ANTENNAS, profile)
-    assert (plain.delay != payload.delay_symbols).mean() > 0.8
-    assert (read.delay != payload.delay_symbols).sum() <= 1
-    assert np.median(read.delay_confidence) > confidence_threshold(15, 136, 180)
-
-
-def moving(paths: list[Path], frames: float, rng: np.random.Generator) -> list[Path]:
-    """The same clutter after so many frames in which each scatterer has come a twentieth of a cell
-    nearer: its carrier has turned by any angle."""
-    cell, first = SHORT.range_cell(1), paths[0]
-    turned = np.exp(2j * np.pi * rng.random(len(paths)))
-    nearer = [
-        replace(p, length=p.length - 0.05 * cell * frames, amplitude=p.amplitude * turn)
-        for p, turn in zip(paths[1:], turned[1:], strict=True)
-    ]
-    return [first, *nearer]
-
-
-def seen(expected: Prediction) -> Detections:
-    """The reference as it was expected."""
-    none = np.zeros((1, 4))
-    yes = np.ones(1, bool)
-    return Detections(
-        range=expected.range,
-        velocity=expected.velocity,
-        direction=expected.direction,
-        snr=np.ones(1),
-        std=none,
-        is_reference=yes,
-    )
-
-
-def test_the_profile_is_learned_anew_from_what_was_read():
-    """At -18 dB a sample, clutter that moves by a cell in twenty frames: what a terminal learns of
-    a data frame is what it would learn of one without data, and it reads on where the first
-    profile is a cell off. Planted bug: the symbols not taken out."""
-    w, schedule, _ = frame(waveform=SHORT)
-    paths, expected = scene(5)
-    rng, noise = np.random.default_rng(31), 10**1.8
-    pilot = cube(w, schedule, unmodulated(w), paths, ANTENNAS, noise, 99)
-    reader, first = ByProfile(8), learn_profile(pilot, expected)
-    profile = first
-    for n in (10, 20):
-        payload = random_payload(w, schedule, 8, rng)
-        received = cube(w, schedule, payload, moving(paths, n, rng), ANTENNAS, noise, n)
-        read = reader.read(received, expected, ANTENNAS, profile)
-        assert (read.delay != payload.delay_symbols).sum() <= 2
-        profile = reader.learn(received, seen(expected), read.raw)
-    old = reader.read(received, expected, ANTENNAS, first)
-    assert (old.delay != payload.delay_symbols).mean() > 0.3
+    received = cube(w, schedule, payload, paths, ANTENNAS, noise, 2).samples
+    wrong = {"cell": 0, "profile": 0}
+    for group, turn, sent in zip(
+        received, derotation(w, expected), payload.delay_symbols, strict=True
+    ):
+        power = (np.abs(np.fft.fft(group * turn, axis=2)) ** 2).sum(axis=0)
+        wrong["cell"] += int((decide(power, [], w)[0] != sent).sum())
+        wrong["profile"] += int((decide(correlate(power, profile), [], w)[0] != sent).sum())
+    assert wrong["cell"] > 0.8 * payload.delay_symbols.size and wrong["profile"] <= 1
 
 
 def test_profile_is_the_cells_power_over_noise():
