@@ -20,6 +20,7 @@ import typer
 from rich.text import Text
 
 import isac_rt
+from isac_rt import registry
 from isac_rt.cli import captures, setting_up, simulation, studies, sweeps
 from isac_rt.cli.console import err
 from isac_rt.cli.interruption import Terminated, say_interrupted
@@ -49,7 +50,24 @@ COMMANDS: dict[Callable[..., None], str] = {
 }
 """The commands, each with an example of its use."""
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+
+class _Commands(typer.core.TyperGroup):
+    """The program's own commands, then those of other packages, which are imported when called."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [*super().list_commands(ctx), *sorted(registry.COMMANDS.installed())]
+
+    def get_command(self, ctx: Any, name: str) -> Any:
+        if name not in self.commands and name in registry.COMMANDS.installed():
+            alone = typer.Typer(add_completion=False)
+            alone.command(name)(registry.COMMANDS.load(name))
+            self.add_command(typer.main.get_command(alone), name)
+        return super().get_command(ctx, name)
+
+
+app = typer.Typer(
+    cls=_Commands, add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False
+)
 for _command, _example in COMMANDS.items():
     app.command(
         _command.__name__.rstrip("_"),

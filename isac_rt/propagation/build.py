@@ -2,42 +2,66 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation import settings
 from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.clutter.rayleigh import RayleighClutter
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.model import Propagation
+from isac_rt.registry import PROPAGATION_MODELS
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Swarm
 
 
-def make_propagation(
-    propagation: settings.Propagation,
-    clutter: settings.Clutter,
-    swarm: Swarm,
-    free: FreeSpace,
-    city: CityMesh,
-    waveform: Waveform,
-    knot_spacing: float = 0.0,
-    floor: NoiseFloor | None = None,
-) -> Propagation:
-    """The model that a scenario asks for. `ray_traced` starts the JIT back end.
+@dataclass(frozen=True)
+class Ground:
+    """What propagation models are made from.
 
-    Rays search for chains of walls from knots that are at most `knot_spacing` of flight apart [m];
-    0: from where a terminal is (`legs.chains`). With `floor` scatterers of the
-    clutter field are merged where noise covers them.
+    Attributes
+    ----------
+    propagation, clutter : settings
+    swarm, city, waveform : of the run
+    free : closed forms of the lines of sight and echoes in free space
+    knot_spacing : flight between the places from which rays search for walls [m]; 0: they search
+        from where a terminal is (`legs.chains`)
+    floor : noise that covers scatterers of the clutter field, which then are merged; None: all stay
     """
-    model: Propagation = free
-    if propagation.model == "ray_traced":
-        from isac_rt import runtime
 
-        runtime.activate()
-        from isac_rt.propagation.raytrace import RayTracer
+    propagation: settings.Propagation
+    clutter: settings.Clutter
+    swarm: Swarm
+    city: CityMesh
+    waveform: Waveform
+    free: FreeSpace
+    knot_spacing: float = 0.0
+    floor: NoiseFloor | None = None
 
-        model = RayTracer(
-            propagation, clutter, swarm, free, city, waveform.carrier_frequency, knot_spacing, floor
-        )
-    if clutter.model == "rayleigh":
-        return RayleighClutter(model, free, clutter, waveform)
+
+def free_space(ground: Ground) -> Propagation:
+    """Lines of sight and echoes alone."""
+    return ground.free
+
+
+def ray_traced(ground: Ground) -> Propagation:
+    """Paths over the city's walls too; starts the JIT back end."""
+    from isac_rt import runtime
+
+    runtime.activate()
+    from isac_rt.propagation.raytrace import RayTracer
+
+    g = ground
+    carrier = g.waveform.carrier_frequency
+    return RayTracer(
+        g.propagation, g.clutter, g.swarm, g.free, g.city, carrier, g.knot_spacing, g.floor
+    )
+
+
+def make_propagation(ground: Ground) -> Propagation:
+    """Make the model that `propagation.model` names, with Rayleigh clutter where that is asked
+    for."""
+    model: Propagation = PROPAGATION_MODELS.load(ground.propagation.model)(ground)
+    if ground.clutter.model == "rayleigh":
+        return RayleighClutter(model, ground.free, ground.clutter, ground.waveform)
     return model

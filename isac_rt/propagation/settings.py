@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from isac_rt.registry import PROPAGATION_MODELS
 from isac_rt.settings import Decibels, Loss, Node, Positive, Problem
 
 
@@ -27,7 +28,7 @@ class Leakage(Node):
 class Propagation(Node):
     """Which paths there are between the terminals and by way of the targets."""
 
-    model: Literal["free_space", "ray_traced"] = "free_space"
+    model: Annotated[str, PROPAGATION_MODELS] = "free_space"
     """How paths are found: `free_space`, the default and the paper's, has lines of sight and echoes
     only; `ray_traced` finds reflections, ghosts and shadows in the city's mesh."""
     max_bounces: Annotated[int, Field(ge=0, le=6)] = 2

@@ -28,7 +28,7 @@ from isac_rt.frame.schedule import Schedule, codes_of, schedule_of
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform, waveform_of
 from isac_rt.hardware.front_end import Ends, FrontEnd, front_end_of
-from isac_rt.propagation.build import make_propagation
+from isac_rt.propagation.build import Ground, make_propagation
 from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.model import Propagation, Traced
@@ -447,7 +447,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
     free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
     floor = noise_floor(scenario, plan, free)
     make = _maker(scenario, plan, free, city, floor)
-    if store is None or scenario.propagation.model == "free_space":
+    if store is None or scenario.propagation.model != "ray_traced":
         propagation = make()
     else:
         content = path_content(scenario.model_dump(mode="json"), digest)
@@ -477,17 +477,9 @@ def _maker(
     scenario: Scenario, plan: Plan, free: FreeSpace, city: CityMesh, floor: NoiseFloor | None
 ) -> Callable[[], Propagation]:
     """What makes the propagation model of a run."""
-    return partial(
-        make_propagation,
-        scenario.propagation,
-        scenario.clutter,
-        plan.swarm,
-        free,
-        city,
-        plan.waveform,
-        plan.max_untraced,
-        floor,
-    )
+    settings = scenario.propagation, scenario.clutter
+    ground = Ground(*settings, plan.swarm, city, plan.waveform, free, plan.max_untraced, floor)
+    return partial(make_propagation, ground)
 
 
 def _expectation_of(
@@ -648,9 +640,8 @@ def propagation_in(city: CityMesh, scenario: Scenario, knot_spacing: float = 0.0
     waveform, swarm = waveform_of(scenario.radio, scenario.array), swarm_of(scenario)
     antennas = antennas_of(scenario.array, waveform)
     free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
-    return make_propagation(
-        scenario.propagation, scenario.clutter, swarm, free, city, waveform, knot_spacing
-    )
+    settings = scenario.propagation, scenario.clutter
+    return make_propagation(Ground(*settings, swarm, city, waveform, free, knot_spacing))
 
 
 def trace(scenario: Scenario, frame: int, *, setup: Setup | None = None) -> dict[Link, PathSet]:

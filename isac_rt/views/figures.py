@@ -195,6 +195,8 @@ def _footprints(ax: Axes, city: CityMesh, low: np.ndarray, high: np.ndarray) -> 
     corners = city.corners + city.origin
     up = np.abs(city.normals[:, 2]) > 0.2
     triangles = corners[up]
+    if not len(triangles):  # walls alone
+        return
     height = triangles[:, :, 2].mean(axis=1)
     first, last = triangles[:, :, :2].min(axis=1), triangles[:, :, :2].max(axis=1)
     seen = np.flatnonzero(((last >= low) & (first <= high)).all(axis=1))

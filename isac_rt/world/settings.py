@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
+from isac_rt.registry import CITY_SOURCES
 from isac_rt.settings import (
     AspectTable,
     Decibels,
@@ -53,7 +54,7 @@ class MaterialOverride(Node):
 class City(Node):
     """Where the mesh of the city comes from. `source` decides which of the other keys apply."""
 
-    source: Literal["builtin", "mitsuba", "mesh", "footprints", "canyon", "blocks"]
+    source: Annotated[str, CITY_SOURCES]
     """Kind of city: `builtin` is a scene that comes with Sionna RT, `mitsuba`, `mesh` and
     `footprints` read a file, `canyon` is one street between two rows of buildings, `blocks` a grid
     of blocks."""
@@ -145,7 +146,8 @@ class City(Node):
     holds."""
 
     def applies(self, name: str) -> bool:
-        return name in CITY_KEYS[self.source] or name in ("source", "keep_radius_m", "materials")
+        known = CITY_KEYS.get(self.source, CITY_KEYS["mesh"])  # of another package
+        return name in known or name in ("source", "keep_radius_m", "materials")
 
     def problems(self) -> Iterator[Problem]:
         for name in type(self).model_fields:

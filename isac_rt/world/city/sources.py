@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from isac_rt.registry import CITY_SOURCES
 from isac_rt.world import settings
 from isac_rt.world.city.materials import CityError, resolve_materials
 from isac_rt.world.city.mesh import CityMesh, Surface, clean, empty_city
@@ -58,6 +60,8 @@ def city_files(city: settings.City | None, folder: Path) -> list[Path]:
     """
     if city is None or city.source in ("canyon", "blocks"):
         return []
+    if city.source not in CITY_SOURCES.own:  # another package's reads the named file alone
+        return [_path(city, folder)] if city.file else []
     path = _path(city, folder)
     if city.source == "footprints":
         from isac_rt.world.city.tables import table_files
@@ -67,21 +71,60 @@ def city_files(city: settings.City | None, folder: Path) -> list[Path]:
     return mesh_files(path) if city.source == "mesh" else mitsuba_files(path)
 
 
-def _surfaces(
-    city: settings.City, folder: Path
-) -> tuple[str, list[Surface], list[str], Place | None]:
-    if city.source in ("canyon", "blocks"):  # shapely is loaded for cities that are extruded
-        from isac_rt.world.city import parametric
+@dataclass(frozen=True)
+class CityParts:
+    """What a source of cities returns.
 
-        made = parametric.canyon if city.source == "canyon" else parametric.blocks
-        return city.name or city.source, made(city), [], None
+    Attributes
+    ----------
+    name : of the city
+    surfaces : in world coordinates, not yet cleaned
+    notes : what was left out or assumed, for the report
+    place : where on Earth the city's origin lies; None where the source does not say
+    """
+
+    name: str
+    surfaces: list[Surface]
+    notes: list[str] = field(default_factory=list)
+    place: Place | None = None
+
+
+def canyon(city: settings.City, folder: Path) -> CityParts:
+    """A street between two rows of buildings."""
+    from isac_rt.world.city import parametric  # shapely is loaded for cities that are extruded
+
+    return CityParts(city.name or "canyon", parametric.canyon(city))
+
+
+def blocks(city: settings.City, folder: Path) -> CityParts:
+    """A grid of blocks."""
+    from isac_rt.world.city import parametric
+
+    return CityParts(city.name or "blocks", parametric.blocks(city))
+
+
+def footprints(city: settings.City, folder: Path) -> CityParts:
+    """Buildings extruded from footprints or read as solids, on their terrain."""
+    from isac_rt.world.city import footprints
+
     path = _path(city, folder)
-    name = city.name or path.name
-    if city.source == "footprints":
-        from isac_rt.world.city.footprints import footprints
+    found = footprints.footprints(city, path, _terrain(city, folder))
+    return CityParts(city.name or path.name, *found)
 
-        return name, *footprints(city, path, _terrain(city, folder))
-    return name, *(mesh_file if city.source == "mesh" else mitsuba_file)(city, path), None
+
+def mesh(city: settings.City, folder: Path) -> CityParts:
+    """A mesh file."""
+    path = _path(city, folder)
+    return CityParts(city.name or path.name, *mesh_file(city, path))
+
+
+def mitsuba(city: settings.City, folder: Path) -> CityParts:
+    """A scene of Mitsuba, or one that comes with Sionna RT (`builtin`)."""
+    path = _path(city, folder)
+    return CityParts(city.name or path.name, *mitsuba_file(city, path))
+
+
+builtin = mitsuba
 
 
 def load_city(
@@ -116,17 +159,18 @@ def load_city(
     if city is None:
         return empty_city("free space", origin)
     with np.errstate(all="ignore"):  # what overflows is refused by `clean`
-        name, surfaces, notes, place = _surfaces(city, Path(folder))
+        parts = CITY_SOURCES.load(city.source)(city, Path(folder))
     uses, materials = resolve_materials(
-        [s.material for s in surfaces], carrier_frequency, city.materials
+        [s.material for s in parts.surfaces], carrier_frequency, city.materials
     )
-    vertices, faces, owner, cleaning, tolerance = clean(surfaces, name, origin, city.keep_radius_m)
+    vertices, faces, owner, cleaning, tolerance = clean(
+        parts.surfaces, parts.name, origin, city.keep_radius_m
+    )
     in_use, face_material = np.unique(np.array(uses)[owner], return_inverse=True)
-    counted = [
-        text if n == 1 else f"{text} ({n} times)" for text, n in Counter(notes + cleaning).items()
-    ]
+    notes = Counter(parts.notes + cleaning).items()
+    counted = [text if n == 1 else f"{text} ({n} times)" for text, n in notes]
     return CityMesh(
-        name,
+        parts.name,
         vertices,
         faces,
         face_material.astype(np.int16),
@@ -134,5 +178,5 @@ def load_city(
         origin,
         tuple(counted),
         tolerance,
-        place=place,
+        place=parts.place,
     )

@@ -1,0 +1,102 @@
+"""Parts that a scenario or a command line chooses by name: this package's own, and those that
+installed packages register by an entry point of the group `isac_rt.KIND`.
+
+A part is imported when it is used. Its page in the documentation is *extending*.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from pydantic import GetJsonSchemaHandler
+from pydantic_core import CoreSchema, core_schema
+
+from isac_rt.runtime import UserError
+
+
+@dataclass(frozen=True)
+class Registry:
+    """The parts of one kind, and the type of a setting that names one of them.
+
+    Parameters
+    ----------
+    kind : the entry points' group is ``isac_rt.KIND``
+    own : "module:object" of this package by name; no other package may take such a name
+
+    Examples
+    --------
+    >>> PROPAGATION_MODELS.load("free_space").__name__
+    'free_space'
+    """
+
+    kind: str
+    own: Mapping[str, str]
+
+    def installed(self) -> dict[str, EntryPoint]:
+        """The parts of other packages by name."""
+        found = entry_points(group=f"isac_rt.{self.kind}")
+        return {part.name: part for part in found if part.name not in self.own}
+
+    def names(self) -> list[str]:
+        """All names: this package's first, then the others' in alphabetical order."""
+        return [*self.own, *sorted(self.installed())]
+
+    def load(self, name: str) -> Any:
+        """Import a part.
+
+        Raises
+        ------
+        UserError  If no part has this name, or another package's cannot be imported.
+        """
+        if name in self.own:
+            module, _, attribute = self.own[name].partition(":")
+            return getattr(import_module(module), attribute)
+        if (part := self.installed().get(name)) is None:
+            raise UserError(f"no {self.kind} {name}; there are {', '.join(self.names())}")
+        try:
+            return part.load()
+        except Exception as problem:
+            source = part.dist.name if part.dist else "another package"
+            raise UserError(
+                f"{name} of {source} ({part.value}) cannot be imported: "
+                f"{type(problem).__name__}: {problem}; mend or uninstall {source}"
+            ) from problem
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
+        """Check that a setting names a part; for `Annotated[str, REGISTRY]`."""
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        return {"type": "string", "enum": self.names()}
+
+    def _checked(self, name: str) -> str:
+        if name not in self.own and name not in self.installed():
+            *most, last = self.names()
+            raise ValueError(f"must be {', '.join(most)} or {last}")
+        return name
+
+
+PROPAGATION_MODELS = Registry(
+    "propagation_models",
+    {
+        "free_space": "isac_rt.propagation.build:free_space",
+        "ray_traced": "isac_rt.propagation.build:ray_traced",
+    },
+)
+"""Functions of `isac_rt.propagation.build.Ground` that return a `Propagation`."""
+CITY_SOURCES = Registry(
+    "city_sources",
+    {
+        name: f"isac_rt.world.city.sources:{name}"
+        for name in ("builtin", "mitsuba", "mesh", "footprints", "canyon", "blocks")
+    },
+)
+"""Functions of the settings `City` and the scenario's folder that return a `CityParts`."""
+COMMANDS = Registry("commands", {})
+"""Functions with typer's annotations, whose docstring is the help."""
