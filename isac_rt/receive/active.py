@@ -9,14 +9,13 @@ from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.schedule import codes_of
 from isac_rt.receive.chain import Refiner, detector_of, filter_of, refiner_of
-from isac_rt.receive.clutter.angle_doppler import AngleDoppler
 from isac_rt.receive.clutter.filter import ClutterFilter
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Detector, look_at, make_maps
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import cleaned
-from isac_rt.receive.types import ExpectedClutter, Gates, Reception
+from isac_rt.receive.types import NO_HINTS, ExpectedClutter, Hints, Reception
 
 
 @dataclass(frozen=True)
@@ -39,12 +38,11 @@ class ActiveReceiver:
         self,
         cube: IFCube | RangeProfiles,
         payload: Payload,
-        clutter: ExpectedClutter | None = None,
+        hints: Hints = NO_HINTS,
         *,
         maps: bool = False,
-        sought: Gates | None = None,
     ) -> Reception:
-        """See `receive_active`; `sought` is where UAVs are expected."""
+        """See `receive_active`."""
         known = Known.of(cube, payload, self.antennas, 2)
         if isinstance(cube, IFCube):
             spectra, known = cleaned(cube, known)
@@ -54,10 +52,7 @@ class ActiveReceiver:
             spectra = spectra.copy()
             self.clutter_filter.clean(spectra, cube.schedule, codes_of(cube.waveform))
         spectra, known = known.decoded(spectra)
-        detector = self.detector
-        if isinstance(detector, AngleDoppler):
-            detector = replace(detector, sought=sought)
-        found = detector.sense(spectra, known, clutter)
+        found = self.detector.sense(spectra, known, hints)
         detections = found.detections
         if self.refiner is not None and isinstance(cube, IFCube):
             detections = self.refiner(Moments(cube.samples, known), detections)[0]
@@ -123,4 +118,4 @@ def receive_active(
     (array([5.]), array([4.]))
     """
     chain = ActiveReceiver.of(antennas, settings)
-    return chain.receive(cube, payload, clutter, maps=maps)
+    return chain.receive(cube, payload, Hints(clutter), maps=maps)

@@ -31,8 +31,9 @@ from isac_rt.receive.symbols.powers import (
     velocity_spread,
 )
 from isac_rt.receive.types import (
+    NO_HINTS,
     Detections,
-    ExpectedClutter,
+    Hints,
     Look,
     Prediction,
     Reception,
@@ -87,21 +88,21 @@ class PassiveReceiver:
         cube: IFCube,
         prediction: Prediction | None,
         modulated: bool,
-        clutter: ExpectedClutter | None = None,
+        hints: Hints = NO_HINTS,
         *,
         maps: bool = False,
     ) -> Reception:
-        """See `receive_passive`; `clutter` is what the terminal expects of its mesh."""
+        """See `receive_passive`."""
         if self.groups is not None and modulated:
             part, every = cube.of_groups(self.groups), replace(self, groups=None)
-            mine = every.receive(part, prediction, True, clutter, maps=maps)
+            mine = every.receive(part, prediction, True, hints, maps=maps)
             return _among_all(mine, self.groups, cube.waveform)
         w = cube.waveform
         if not modulated:
             pilot = Known.unmodulated(w, cube.schedule, self.antennas, 1)
             spectra, known = cleaned(cube, pilot)
             moments = Moments(cube.samples, known)
-            found = self.detector.sense(spectra, known, clutter)
+            found = self.detector.sense(spectra, known, hints)
             detections, reference = self._earliest(found, known)
             found = replace(found, looks=self._look(spectra, known, detections, reference))
             detections, reference = self._alone(moments, detections, reference)
@@ -116,7 +117,7 @@ class PassiveReceiver:
         read = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
         spectra, known = cleaned(cube, read)
         moments = Moments(cube.samples, known)
-        found, detections, reference = self._sense_data(spectra, moments, prediction, clutter)
+        found, detections, reference = self._sense_data(spectra, moments, prediction, hints)
         phases = None
         if self.refiner is not None and reference is not None:
             phases = self._phases(moments, detections)
@@ -125,9 +126,7 @@ class PassiveReceiver:
             if np.abs(turn - 1).max() > SAME_PHASE:
                 spectra = spectra * turn.astype(np.complex64)[:, None, None]
                 moments = moments.read_by(replace(known, phases=phases))
-                found, detections, reference = self._sense_data(
-                    spectra, moments, prediction, clutter
-                )
+                found, detections, reference = self._sense_data(spectra, moments, prediction, hints)
         else:
             spread = velocity_spread(symbols, self.reader.order, prediction, w)
             detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))
@@ -142,7 +141,7 @@ class PassiveReceiver:
         self,
         cube: IFCube,
         path: Prediction,
-        clutter: ExpectedClutter | None = None,
+        hints: Hints = NO_HINTS,
         *,
         maps: bool = False,
     ) -> Reception:
@@ -150,7 +149,7 @@ class PassiveReceiver:
         its reference the earliest detection. Otherwise as `receive`."""
         if self.groups is not None:
             part, every = cube.of_groups(self.groups), replace(self, groups=None)
-            mine = every.receive_over(part, path, clutter, maps=maps)
+            mine = every.receive_over(part, path, hints, maps=maps)
             return _among_all(mine, self.groups, cube.waveform)
         w = cube.waveform
         symbols = self.reader.read(cube, path, self.antennas)
@@ -159,7 +158,7 @@ class PassiveReceiver:
         read = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
         spectra, known = cleaned(cube, read)
         moments = Moments(cube.samples, known)
-        found = self.detector.sense(spectra, known, clutter)
+        found = self.detector.sense(spectra, known, hints)
         detections, reference = self._alone(moments, *self._earliest(found, known))
         spread = velocity_spread(symbols, self.reader.order, path, w)
         detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))
@@ -199,11 +198,11 @@ class PassiveReceiver:
         spectra: np.ndarray,
         moments: Moments,
         prediction: Prediction,
-        clutter: ExpectedClutter | None,
+        hints: Hints,
     ) -> tuple[Sensed, Detections, Estimate | None]:
         """What a frame shows once its symbols are taken out, with the reference put first."""
         known = moments.known
-        found = self.detector.sense(spectra, known, clutter)
+        found = self.detector.sense(spectra, known, hints)
         detections, reference = self._at_prediction(spectra, known, found, prediction)
         found = replace(found, looks=self._look(spectra, known, detections, reference))
         return found, *self._alone(moments, detections, reference)

@@ -37,7 +37,7 @@ from isac_rt.receive.maps import (
 from isac_rt.receive.omp import Omp, sparse_enough
 from isac_rt.receive.sense import Cfar, Sensed, describe, doppler_of, window_gain
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import ExpectedClutter
+from isac_rt.receive.types import NO_HINTS, Hints
 
 FARTHEST_REACH = 24
 """Range rows on each side in which the strongest paths are taken out; Hann's lobes are 90 dB down
@@ -65,9 +65,7 @@ class Pursuit(Cfar):
 
     doppler: LatinUnion | None = LATIN_UNION
 
-    def sense(
-        self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
-    ) -> Sensed:
+    def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
         paths, snr, power = pursue(spectra, known, self.settings)
         above, level = self.rule(known).detect(power)
         sparse = None
@@ -82,12 +80,10 @@ class BySchedule(Cfar):
     """The CFAR on the map that the schedule asks for, and `Pursuit` where slow time is sampled
     sparsely: there the map has sidelobes at all velocities. On the grid the paper's OMP."""
 
-    def sense(
-        self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
-    ) -> Sensed:
+    def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
         if isinstance(doppler_of(known), Omp) and not self.estimator.on_grid:
-            return Pursuit(self.settings, self.estimator).sense(spectra, known, clutter)
-        return super().sense(spectra, known, clutter)
+            return Pursuit(self.settings, self.estimator).sense(spectra, known, hints)
+        return super().sense(spectra, known, hints)
 
 
 @dataclass

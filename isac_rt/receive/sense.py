@@ -33,7 +33,7 @@ from isac_rt.receive.maps import (
 )
 from isac_rt.receive.omp import Omp, advise
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Look, Maps, Neighbours
+from isac_rt.receive.types import NO_HINTS, Correction, Detections, Hints, Look, Maps, Neighbours
 
 MIXED = 0.1
 """Power of other paths over its own from which a detection starts no track, beside what noise
@@ -62,10 +62,8 @@ class Sensed:
 class Detector(Protocol):
     """What finds paths in cleaned spectra (M, L_rx, rows, P)."""
 
-    def sense(
-        self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
-    ) -> Sensed:
-        """What a frame shows; `clutter` is what the terminal expects of its mesh there."""
+    def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
+        """Return what a frame shows."""
         ...
 
 
@@ -105,9 +103,7 @@ class Cfar:
         separate = self.way(known).separate
         return self.estimator.at_peaks(spectra, known, power, rows, columns, separate=separate)
 
-    def sense(
-        self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
-    ) -> Sensed:
+    def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
         """Range-Doppler map, CFAR, peaks, and an estimate of each."""
         way = self.way(known)
         power = way.power(spectra, known)

@@ -381,3 +381,20 @@ class Correction:
             delay_rate=clutter.delay_rate - closing / SPEED_OF_LIGHT,
             power=clutter.power * np.exp(self.level),
         )
+
+
+@dataclass(frozen=True)
+class Hints:
+    """What a terminal expects of a frame before it looks at the samples.
+
+    Attributes
+    ----------
+    clutter : what its city returns; None: unknown
+    gates : where UAVs are; None: nowhere
+    """
+
+    clutter: ExpectedClutter | None = None
+    gates: Gates | None = None
+
+
+NO_HINTS = Hints()

@@ -18,7 +18,7 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.symbols.blind import DataPath, Peaks, acquire
-from isac_rt.receive.types import Detections, ExpectedClutter, Reception
+from isac_rt.receive.types import Detections, Hints, Reception
 
 BATCH = 8
 """Frames kept at most."""
@@ -71,20 +71,20 @@ class Retrospect:
         self,
         cube: IFCube,
         time: float,
-        clutter: ExpectedClutter | None,
+        hints: Hints,
         *,
         maps: bool,
     ) -> Reception | None:
         """A data frame that the line of sight does not read, over the path that is known or that it
         makes known; None where there is none yet."""
         if self.path is not None:
-            out = self._over(cube, time, clutter, maps=maps)
+            out = self._over(cube, time, hints, maps=maps)
             if out is not None:
                 return out
         self.path = self._learn(cube, time, True)
         if self.path is None:
             return None
-        return self._over(cube, time, clutter, maps=maps)
+        return self._over(cube, time, hints, maps=maps)
 
     def look(self, cube: IFCube, time: float) -> None:
         """A frame without data, which tells the whole cells of those that wait."""
@@ -141,7 +141,7 @@ class Retrospect:
         self,
         cube: IFCube,
         time: float,
-        clutter: ExpectedClutter | None,
+        hints: Hints,
         *,
         maps: bool,
     ) -> Reception | None:
@@ -151,7 +151,7 @@ class Retrospect:
         expected = self.path.prediction
         if expected.range_std[0] > COAST_CELLS * self._cells[0]:
             return None
-        out = self._receiver.receive_over(cube, expected, clutter, maps=maps)
+        out = self._receiver.receive_over(cube, expected, hints, maps=maps)
         if not out.decoded:
             return None
         d = out.detections

@@ -29,6 +29,7 @@ from isac_rt.receive.types import (
     Detections,
     ExpectedClutter,
     Gates,
+    Hints,
     Prediction,
     Reception,
 )
@@ -207,7 +208,7 @@ class ActiveTerminal:
         `other`, which is given the same."""
         if self.other is not None:
             return self.other.receive(cube, payload, clutter, maps)
-        return self._receiver.receive(cube, payload, clutter, maps=maps, sought=self._gates)
+        return self._receiver.receive(cube, payload, Hints(clutter, self._gates), maps=maps)
 
     def _sought(self, own: Pose, told: Sequence[KnownBody]) -> Gates | None:
         """Where tracks that move, and other terminals by their word, are expected; None: that is
@@ -410,7 +411,7 @@ class PassiveTerminal:
             kept.forget()
         if anchored or reception.decoded:
             return reception, anchored
-        out = kept.read(cube, time, self._clutter, maps=maps)
+        out = kept.read(cube, time, Hints(self._clutter), maps=maps)
         if out is None:
             return reception, False
         out = replace(out, detections=self._late(out.detections, -1))
@@ -524,7 +525,8 @@ class PassiveTerminal:
         `other`, which is given the same."""
         if self.other is not None:
             return self.other.receive(cube, prediction, modulated, maps)
-        return self._receiver.receive(cube, prediction, modulated, self._clutter, maps=maps)
+        hints = Hints(self._clutter)
+        return self._receiver.receive(cube, prediction, modulated, hints, maps=maps)
 
     @property
     def _clock(self) -> np.ndarray:

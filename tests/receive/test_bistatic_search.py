@@ -22,7 +22,7 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.passive import PassiveReceiver, receive_passive
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.types import ExpectedClutter
+from isac_rt.receive.types import ExpectedClutter, Hints
 
 W = Waveform(num_samples=256, num_chirps=24)
 SEARCH = search_of(ANTENNAS, 2 * np.pi * float(W.carrier()) / 299792458.0)
@@ -147,7 +147,7 @@ def test_a_strong_path_starts_a_track_where_there_is_no_city():
     receiver = PassiveReceiver.of(ANTENNAS, Receivers(passive_detector="beams"), 8)
     empty = ExpectedClutter(*(np.zeros(s) for s in (0, 0, 0, (0, 3), (0, 3))))
     for clutter, starts in ((None, True), (empty, False)):
-        d = receiver.receive(samples, None, False, None, clutter).detections
+        d = receiver.receive(samples, None, False, Hints(clutter)).detections
         assert len(d) == 2 and bool(d.starts[~d.is_reference][0]) is starts
 
 

@@ -25,7 +25,7 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.types import ExpectedClutter
+from isac_rt.receive.types import ExpectedClutter, Hints
 
 SHORT = Waveform(num_samples=256, num_chirps=60)
 FEW = replace(ANTENNAS, rx_x=3, rx_z=2)
@@ -193,7 +193,7 @@ def test_detections_and_births_keep_their_rates_in_noise():
     settings = Receivers(
         clutter_detector="angle_doppler", false_alarm_rate=4e-3, update_false_alarm_rate=2e-2
     )
-    (judged,) = AngleDoppler(settings).judge([maps], sent, nothing)
+    (judged,) = AngleDoppler(settings).judge([maps], sent, Hints(nothing))
     for ratio, rate in ((judged.ratio, 2e-2), (judged.sure, 4e-3)):
         hits, cells = int((ratio > 1).sum()), ratio.size
         assert stats.binom.ppf(FALSE_FAILURE, cells, rate / 3) <= hits
@@ -259,7 +259,7 @@ def test_background_is_noise_and_expected_clutter():
     maps = maps_of(w, schedule, payload, [], FEW, 110, noise=0.7, seed=2)
     settings = Receivers(clutter_detector="angle_doppler")
     sent = known(w, schedule, payload, FEW)
-    (judged,) = AngleDoppler(settings).judge([maps], sent, guess)
+    (judged,) = AngleDoppler(settings).judge([maps], sent, Hints(guess))
     noise = judged.level - expected_power(guess, sent, 110)
     assert np.ptp(noise) < 1e-5 * judged.level.max()
     mean = (np.abs(maps) ** 2).mean()
@@ -420,7 +420,7 @@ def test_an_echo_over_a_wall_on_one_way_starts_no_track(ways, beside, clutter, s
     guess = expected([Path(60.0, 9.0, 0.05, (0.1, -0.1), (0.1, -0.1))])
     guess = guess if clutter else guess.select(np.zeros(1, bool))
     settings = Receivers(clutter_detector="angle_doppler")
-    d = AngleDoppler(settings, fitted=False).sense(spectra, sent, guess).detections
+    d = AngleDoppler(settings, fitted=False).sense(spectra, sent, Hints(guess)).detections
     best = d.snr.argmax()
     assert abs(d.range[best] - 30.0) < w.range_cell(2)
     assert bool(d.starts[best]) is starts

@@ -12,7 +12,7 @@ from isac_rt.receive.clutter.angle_doppler import AngleDoppler
 from isac_rt.receive.clutter.correction import UNTAPERED, fit
 from isac_rt.receive.clutter.power import TAPER, Response, expected_power
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import ExpectedClutter
+from isac_rt.receive.types import ExpectedClutter, Hints
 
 C = 299_792_458.0
 W = Waveform(num_samples=256)
@@ -169,7 +169,7 @@ def test_detectors_judge_with_the_corrected_clutter():
     )
     maps = (white * np.fft.ifftshift(np.sqrt(mean), axes=1)).astype(np.complex64)
     detector = AngleDoppler(Receivers(clutter_detector="angle_doppler"))
-    (judged,) = detector.judge([maps], known(W, schedule, payload), wrong)
+    (judged,) = detector.judge([maps], known(W, schedule, payload), Hints(wrong))
     strong = mean > 3 * noise
     off = judged.level[strong] / mean[strong] - 1
     assert strong.sum() > 500 and np.median(np.abs(off)) < 0.15

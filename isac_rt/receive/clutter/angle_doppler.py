@@ -43,7 +43,7 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import UNION_FLOOR, accumulate, maps_with_power
 from isac_rt.receive.sense import Sensed, describe
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import Correction, ExpectedClutter, Gates
+from isac_rt.receive.types import NO_HINTS, Correction, ExpectedClutter, Gates, Hints
 
 LEAST = 0.03
 """Cells whose expected clutter is less than this share of the noise are taken to hold noise
@@ -91,25 +91,22 @@ class AngleDoppler:
     taper : how uncertain the expected clutter is
     fitted : correct the own velocity and the clutter's level by the first frame
         (`isac_rt.receive.clutter.correction`) before anything is decided
-    sought : where UAVs are expected, with a threshold of their own
-        (`isac_rt.receive.clutter.gates`); None: nowhere
     """
 
     settings: Receivers
     estimator: Estimator = OFF_GRID
     taper: Taper = TAPER
     fitted: bool = True
-    sought: Gates | None = None
 
-    def sense(
-        self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
-    ) -> Sensed:
+    def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
         """Detections in cleaned spectra of echoes; raises as `judge`."""
         (maps, power), correction = maps_with_power(spectra, known), None
+        clutter = hints.clutter
         if clutter is not None and self.fitted:
             correction = correct(power, known, clutter)
             clutter = correction.apply(clutter)
-        judged = replace(self, fitted=False).judge([maps], known, clutter)[0]
+        hints = replace(hints, clutter=clutter)
+        judged = replace(self, fitted=False).judge([maps], known, hints)[0]
         ratio, first = judged.ratio.copy(), first_row(self.settings, known.range_cell)
         ratio[:first] = 0
         rows, bins = strongest_peaks(ratio, ratio > 1, self.settings, UNION_FLOOR)
@@ -139,25 +136,25 @@ class AngleDoppler:
         noise = noise_level(power, expected, known.channels)
         return replace(out, neighbours=phases(maps, expected, noise, known, clutter))
 
-    def judge(
-        self, frames: Sequence[np.ndarray], known: Known, clutter: ExpectedClutter | None = None
-    ) -> list[Judged]:
-        """The verdict on frames that share their data and the expected clutter.
+    def judge(self, frames: Sequence[np.ndarray], known: Known, hints: Hints) -> list[Judged]:
+        """The verdict on frames that share their data and what is expected of them.
 
         Parameters
         ----------
         frames : (L_tx, L_rx, rows, P) complex64 of `channel_maps` each
         known : Known
-        clutter : what is expected
+        hints : the expected clutter, and gates, which have thresholds of their own
+            (`isac_rt.receive.clutter.gates`)
 
         Raises
         ------
         ValueError  If there is no expected clutter.
         """
         powers = [accumulate(maps) for maps in frames]
-        clutter, expected, noise = self.expectation(powers, known, clutter)
+        clutter, expected, noise = self.expectation(powers, known, hints.clutter)
+        hints = replace(hints, clutter=clutter)
         return [
-            self._judge(maps, power, n, expected, known, clutter)
+            self._judge(maps, power, n, expected, known, hints)
             for maps, power, n in zip(frames, powers, noise, strict=True)
         ]
 
@@ -184,8 +181,9 @@ class AngleDoppler:
         noise: float,
         expected: np.ndarray,
         known: Known,
-        clutter: ExpectedClutter,
+        hints: Hints,
     ) -> Judged:
+        assert hints.clutter is not None  # `expectation` has it
         everything, arms = searches(known.antennas, known.wavenumber)
         limits = self._limits(everything, known), self._limits(arms, known)
         plain = search_plain(maps, everything, noise, PRUNED * limits[0][0])
@@ -199,7 +197,7 @@ class AngleDoppler:
         note(plain, limits[0])
         filled = np.fft.ifftshift(expected, axes=1).ravel() > LEAST * noise
         cell = plain.cell[filled[plain.cell] & (plain.peak > PRUNED * limits[1][0])]
-        bucketed = Bucketed.of(clutter, known, everything, noise, self.taper)
+        bucketed = Bucketed.of(hints.clutter, known, everything, noise, self.taper)
 
         def heard(cell: np.ndarray, search: Search) -> np.ndarray:
             c = search.channels
@@ -214,7 +212,7 @@ class AngleDoppler:
         R = bucketed.covariances(*np.divmod(cell, power.shape[1]))
         note(search_white(heard(cell, everything), R, cell, everything, 0.0), limits[0])
         inverse = dict(zip(cell.tolist(), inverses(R), strict=True))
-        for gate in self._gates(known, len(power), ratio, cosines):
+        for gate in _gates(hints.gates, known, len(power), ratio, cosines):
             quiet = not filled[gate.cell].any()
             whiten = None if quiet else bucketed.covariances(*np.divmod(gate.cell, power.shape[1]))
             found = seek(gate, heard(gate.cell, everything), whiten, everything)
@@ -232,16 +230,6 @@ class AngleDoppler:
         passed = shown[0] / held_up, shown[1] / held_up
         return Judged(*passed, noise + expected, shown[2], whiteners)
 
-    def _gates(
-        self, known: Known, rows: int, ratio: np.ndarray, cosines: np.ndarray
-    ) -> Iterator[Gate]:
-        """Where UAVs are sought in which nothing was found yet, but for cells that hold something
-        from elsewhere: what it leaves in other directions is no noise."""
-        for gate in () if self.sought is None else gates_of(self.sought, known, rows):
-            full = ratio[gate.cell] > 1
-            if not full.all() and not (gate.holds(cosines[gate.cell]) & full).any():
-                yield replace(gate, cell=gate.cell[~full])
-
     def _limits(self, search: Search, known: Known) -> tuple[float, float]:
         """Thresholds of a detection and of one that may start a track."""
         size = scanned(search.channels, known.wavenumber, known.antennas.view_limit)
@@ -254,6 +242,17 @@ class AngleDoppler:
         target = ndimage.binary_dilation(ratio > 1, np.ones((3, 3), bool))
         rule = CfarRule.of(self.settings, 1)
         return np.maximum(rule.background(found, ~(target | strong_lobes(found))), 1.0)
+
+
+def _gates(
+    expected: Gates | None, known: Known, rows: int, ratio: np.ndarray, cosines: np.ndarray
+) -> Iterator[Gate]:
+    """Gates in which nothing was found yet, but for cells that hold something from elsewhere: what
+    it leaves in other directions is no noise."""
+    for gate in () if expected is None else gates_of(expected, known, rows):
+        full = ratio[gate.cell] > 1
+        if not full.all() and not (gate.holds(cosines[gate.cell]) & full).any():
+            yield replace(gate, cell=gate.cell[~full])
 
 
 class BeamSpectra(LocalSpectra):

@@ -46,7 +46,7 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import UNION_FLOOR
 from isac_rt.receive.pursuit import LEFT_OVER_DB, BySchedule, take_strong
 from isac_rt.receive.sense import Sensed, describe
-from isac_rt.receive.types import Detections, ExpectedClutter
+from isac_rt.receive.types import NO_HINTS, Detections, ExpectedClutter, Hints
 
 LEAST = 0.03
 """Cells whose expected clutter is less than this share of the noise are taken to hold noise
@@ -69,11 +69,10 @@ STD_CELLS = 0.1
 class BeamSearch(BySchedule):
     """The CFAR for paths that stand out, beams for those that do not."""
 
-    def sense(
-        self, spectra: np.ndarray, known: Known, clutter: ExpectedClutter | None = None
-    ) -> Sensed:
+    def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
         if not known.full:
-            return super().sense(spectra, known, clutter)
+            return super().sense(spectra, known, hints)
+        clutter = hints.clutter
         strong, snr, power, left, maps, rest = take_strong(spectra, known, self.settings)
         _, level = self.rule(known).detect(power)
         left_over = Remainder.of(strong, snr, known, rest.shape)

@@ -32,7 +32,7 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.types import ExpectedClutter
+from isac_rt.receive.types import ExpectedClutter, Hints
 from isac_rt.results.metrics import binomial_interval
 from isac_rt.studies.paper.clutter_scenes import (
     PLACES,
@@ -234,7 +234,7 @@ def _ratios(
     if settings.clutter_detector == "cfar":
         rule = CfarRule.of(settings, known.channels)
         return [rule.ratio(accumulate(maps))[0] for maps in frames]
-    judged = AngleDoppler(settings, fitted=fitted).judge(frames, known, expected)
+    judged = AngleDoppler(settings, fitted=fitted).judge(frames, known, Hints(expected))
     return [one.ratio for one in judged]
 
 
