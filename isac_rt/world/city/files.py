@@ -46,9 +46,12 @@ def needs_extra(module: str, name: str, kind: str) -> Any:
     try:
         return import_module(module)
     except ImportError:
-        raise CityError(
-            f"{name}: to read {kind}, install its readers: pip install 'isac_rt[cities]'"
-        ) from None
+        raise missing_extra(name, kind) from None
+
+
+def missing_extra(name: str, kind: str) -> CityError:
+    """The message that the extra `cities` is not installed."""
+    return CityError(f"{name}: to read {kind}, install its readers: pip install 'isac_rt[cities]'")
 
 
 Document = TypeVar("Document", bound=BaseModel)

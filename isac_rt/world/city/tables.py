@@ -3,31 +3,55 @@ OpenStreetMap's XML and PBF."""
 
 from __future__ import annotations
 
-import warnings
+import itertools
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from isac_rt.world.city.buildings import Feature
-from isac_rt.world.city.files import needs_extra, read_bytes
+from isac_rt.world.city.files import missing_extra, read_bytes
 from isac_rt.world.city.materials import CityError
 
-TABLES: dict[str, tuple[str, tuple[bytes, ...]]] = {
-    ".gpkg": ("GeoPackage", (b"SQLite format 3\0",)),
-    ".shp": ("Shapefile", (b"\0\0\x27\x0a",)),
-    ".fgb": ("FlatGeobuf", (b"fgb",)),
-    ".parquet": ("GeoParquet", (b"PAR1",)),
-    ".geoparquet": ("GeoParquet", (b"PAR1",)),
-    ".osm": ("OpenStreetMap XML", (b"<",)),
-    ".pbf": ("OpenStreetMap PBF", (b"\0\0\0",)),
+
+class Table(NamedTuple):
+    """A kind of table: its name, how such a file begins, and the only driver that may read it."""
+
+    kind: str
+    start: bytes
+    driver: str
+
+
+TABLES = {
+    ".gpkg": Table("GeoPackage", b"SQLite format 3\0", "GPKG"),
+    ".shp": Table("Shapefile", b"\0\0\x27\x0a", "ESRI Shapefile"),
+    ".fgb": Table("FlatGeobuf", b"fgb", "FlatGeobuf"),
+    ".parquet": Table("GeoParquet", b"PAR1", "Parquet"),
+    ".geoparquet": Table("GeoParquet", b"PAR1", "Parquet"),
+    ".osm": Table("OpenStreetMap XML", b"<", "OSM"),
+    ".pbf": Table("OpenStreetMap PBF", b"\0\0\0", "OSM"),
 }
-"""What each ending stands for, and how such a file begins: GDAL goes by content."""
+"""What each ending stands for."""
 _BESIDE = (".shx", ".dbf", ".prj", ".cpg")
 PBF_FACTOR = 60
 """Memory over the size of a PBF file."""
 _FACTOR = 12
+_BASE_BYTES, _BASE_S = 500_000_000, 1
+"""Memory and processor time of the process that reads a table, without the table."""
+_BYTES_PER_S = 1e6
+"""Of a table: a tenth of what GDAL reads on one core."""
+_ROOT = re.compile(rb"\s*(<\?xml[^>]*>\s*)?(<!--.*?-->\s*)*<osm[\s>/]", re.DOTALL)
+"""How OpenStreetMap's XML begins."""
 
 
 def table_files(path: Path) -> list[Path]:
@@ -46,92 +70,76 @@ def read_table(path: Path, layer: str | None, notes: list[str]) -> tuple[list[Fe
     ------
     CityError  If the file is not what its name says, or the readers are not installed.
     """
-    kind, starts = TABLES[path.suffix.lower()]
-    data = read_bytes(path, PBF_FACTOR if path.suffix.lower() == ".pbf" else _FACTOR)
-    if not data.lstrip(b"\xef\xbb\xbf \r\n\t" if starts == (b"<",) else b"").startswith(starts):
-        raise CityError(f"{path.name}: is no {kind}; check its ending")
-    if starts == (b"<",) and (b"<!DOCTYPE" in data or b"\0" in data):  # \0: in two bytes a letter
-        raise CityError(f"{path.name}: has a document type; remove it")
-    needs_extra("pyogrio", path.name, kind)
-    geopandas = needs_extra("geopandas", path.name, kind)
+    table = TABLES[path.suffix.lower()]
+    factor = PBF_FACTOR if path.suffix.lower() == ".pbf" else _FACTOR
+    files = [(file.name, read_bytes(file, factor)) for file in table_files(path)]
+    _check_start(path.name, table, files[0][1])
+    for package in ("pyogrio", "geopandas"):
+        if find_spec(package) is None:
+            raise missing_extra(path.name, table.kind)
+    found, shapes = _read_apart(table, files, factor, layer)
+    if "refused" in found:
+        raise CityError(f"{path.name}: {found['refused']}")
+    if "problem" in found:
+        raise CityError(f"{path.name}: not readable as {table.kind} ({found['problem']})")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of an ending that bytes do not have, and the like
-            table = (
-                _parquet(geopandas, data)
-                if kind == "GeoParquet"
-                else _by_gdal(geopandas, path, data, _layer(path, data, kind, layer))
-            )
-    except CityError:
-        raise
-    except Exception as error:
-        raise CityError(
-            f"{path.name}: not readable as {kind} ({type(error).__name__}: {error})"
-        ) from None
-    if not hasattr(table, "crs"):
-        raise CityError(f"{path.name}: {layer or 'its layer'} has no shapes; set city.layer")
-    return _features(table, path.name), "" if table.crs is None else table.crs.to_wkt()
+        return _features(shapely.from_wkb(shapes), found["columns"], path.name), found["crs"]
+    except shapely.errors.ShapelyError as error:
+        raise CityError(f"{path.name}: not readable as {table.kind} ({error})") from None
 
 
-def _parquet(geopandas: Any, data: bytes) -> Any:
-    from io import BytesIO
+def _check_start(name: str, table: Table, data: bytes) -> None:
+    """Refuse a file that does not begin as its ending says."""
+    xml = table.kind == "OpenStreetMap XML"
+    text = data.removeprefix(b"\xef\xbb\xbf")
+    if not (text.lstrip() if xml else data).startswith(table.start):
+        raise CityError(f"{name}: is no {table.kind}; check its ending")
+    if xml and (b"<!DOCTYPE" in data or b"\0" in data):  # \0: in two bytes a letter
+        raise CityError(f"{name}: has a document type; remove it")
+    if xml and not _ROOT.match(text):
+        raise CityError(f"{name}: is no OpenStreetMap XML, which begins with <osm>; check it")
 
-    return geopandas.read_parquet(BytesIO(data))
 
-
-def _by_gdal(geopandas: Any, path: Path, data: bytes, layer: str | None) -> Any:
-    return geopandas.read_file(
-        path if path.suffix.lower() == ".shp" else data, layer=layer, engine="pyogrio"
-    )
-
-
-def _layer(path: Path, data: bytes, kind: str, wanted: str | None) -> str | None:
-    """The layer with buildings."""
-    import pyogrio
-
-    if kind.startswith("OpenStreetMap"):
-        return "multipolygons"
-    if kind == "Shapefile":
-        return None
-    layers = [(str(name), str(shape)) for name, shape in pyogrio.list_layers(data)]
-    names = [name for name, _ in layers]
-    if wanted is not None and wanted not in names:
-        raise CityError(
-            f"{path.name}: has no layer {wanted!r} (city.layer); it has {', '.join(names)}"
+def _read_apart(
+    table: Table, files: Sequence[tuple[str, bytes]], factor: float, layer: str | None
+) -> tuple[dict[str, Any], list[bytes]]:
+    """What `table_process` answers: its line, and each row's shape as well-known binary."""
+    size = sum(len(content) for _, content in files)
+    seconds = _BASE_S + math.ceil(size * factor / _FACTOR / _BYTES_PER_S)
+    memory = _BASE_BYTES + int(size * factor)
+    packages = json.dumps([place for place in sys.path if os.path.isabs(place)])
+    program = [str(Path(__file__).with_name("table_process.py")), packages]
+    # files of the working folder are not this process's, nor are settings for Python
+    request = json.dumps({"layer": layer, "files": [(n.lower(), len(c)) for n, c in files]})
+    try:
+        answer = subprocess.run(
+            [sys.executable, "-I", "-S", *program, table.driver, str(memory), str(seconds)],
+            input=b"\n".join([request.encode(), b"".join(content for _, content in files)]),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            cwd="/",
+            timeout=10 * seconds,
         )
-    if wanted is not None:
-        return wanted
-    areas = [name for name, shape in layers if "Polygon" in shape or "Unknown" in shape]
-    called = [name for name in areas if "building" in name.lower()]
-    chosen = called if len(called) == 1 else areas
-    if len(chosen) != 1:
-        raise CityError(
-            f"{path.name}: which layer holds the buildings? Set city.layer to one of "
-            f"{', '.join(areas or names)}"
-        )
-    return chosen[0]
+    except subprocess.TimeoutExpired:
+        return {"problem": f"it takes longer than {10 * seconds} s"}, []
+    if answer.returncode:
+        allowed = f"{seconds} s and {memory / 1e9:.2g} GB, allowed for {size / 1e6:.3g} MB"
+        return {"problem": f"it takes more than {allowed}, or ended the reader"}, []
+    line, _, blobs = answer.stdout.partition(b"\n")
+    found = json.loads(line)
+    ends = np.cumsum([0, *found["lengths"]]).tolist()
+    return found, [blobs[a:b] for a, b in itertools.pairwise(ends)]
 
 
-def _features(table: Any, name: str) -> list[Feature]:
+def _features(
+    shapes: NDArray[np.object_], columns: Mapping[str, Sequence[Any]], name: str
+) -> list[Feature]:
     """Rows as features; what is missing is left out of their properties."""
-    shapes = shapely.force_2d(np.asarray(table.geometry.values))
     areas = np.isin(shapely.get_type_id(shapes), (3, 6))
-    rows = table.drop(columns=table.geometry.name).to_dict("records")
+    shapes = shapely.force_2d(shapes)
     found = []
-    for i, (shape, row, area) in enumerate(zip(shapes, rows, areas.tolist(), strict=True)):
-        own = {str(key): _plain(value) for key, value in row.items()}
-        own = {key: value for key, value in own.items() if value is not None}
+    for i, (shape, area) in enumerate(zip(shapes, areas.tolist(), strict=True)):
+        own = {key: cells[i] for key, cells in columns.items() if cells[i] is not None}
         number = own.get("osm_id") or own.get("osm_way_id") or own.get("id") or f"row {i}"
         found.append(Feature(shape if area else shapely.Polygon(), own, f"{name}: {number}"))
     return found
-
-
-def _plain(value: Any) -> Any:
-    """A cell as JSON would hold it."""
-    import pandas as pd  # most cities are read without
-
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, np.ndarray | list):  # GeoParquet's, of which no tag is one
-        return None
-    return None if pd.isna(value) else value
