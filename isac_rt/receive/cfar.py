@@ -15,7 +15,6 @@ import numpy as np
 from scipy import optimize, special
 
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.order import median
 from isac_rt.receive.settings import Receivers
 
 HANN_CORRELATION = ((2 / 3) ** 2, (1 / 6) ** 2)
@@ -225,7 +224,7 @@ def strong_lobes(power: np.ndarray) -> np.ndarray:
     A line of sight 60 dB over the noise would otherwise raise the background of every target within
     the training block. A row is allowed for migration.
     """
-    noise = median(power)
+    noise = float(np.median(power))
     rows, bins = peaks(power, power > STRONG * noise, (8, 8))
     reached = np.zeros(power.shape, bool)
     for row, column in zip(rows[:MAX_STRONG], bins[:MAX_STRONG], strict=True):

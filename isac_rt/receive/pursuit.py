@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.order import median
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.cfar import CfarRule, first_row, hann_envelope, peaks, without_sidelobes
 from isac_rt.receive.estimate import (
@@ -70,7 +69,7 @@ class Pursuit(Cfar):
         above, level = self.rule(known).detect(power)
         sparse = None
         if not known.full:
-            noise = median(power) / window_gain(known)
+            noise = float(np.median(power)) / window_gain(known)
             sparse = sparse_enough(spectra, np.flatnonzero(above.any(axis=1)), noise, known)
         return Sensed(paths, describe(paths, snr, known), power, level, sparse)
 
@@ -118,7 +117,7 @@ def pursue(
     rule, first = CfarRule.of(settings, known.channels), first_row(settings, known.range_cell)
     power = power_map(left, known)
     whole = power.copy()
-    noise = max(median(power), 1e-30)
+    noise = max(float(np.median(power)), 1e-30)
     taken = np.zeros(power.shape)  # power under which a cell holds a remainder
     found: list[_Path] = []
     while len(found) < settings.max_detections:
@@ -163,7 +162,7 @@ def take_strong(spectra: np.ndarray, known: Known, settings: Receivers) -> Taken
     maps, power = maps_with_power(left, known)
     whole = known.mapped(spectra, lambda: power)
     power = whole.copy()
-    noise = max(median(power), 1e-30)
+    noise = max(float(np.median(power)), 1e-30)
     taken, level = np.zeros(power.shape), np.full(power.shape, noise)
     found: list[_Path] = []
     for _ in range(STRONG_ROUNDS):

@@ -10,7 +10,6 @@ import numpy as np
 import scipy.fft
 
 from isac_rt.frame.cube import IFCube, RangeProfiles
-from isac_rt.kernels.order import median
 from isac_rt.receive.cfar import CfarRule, first_row, strongest_peaks
 from isac_rt.receive.estimate import (
     OFF_GRID,
@@ -112,7 +111,7 @@ class Cfar:
         sparse, recovered = None, None
         if way.advises:
             added = len(known.schedule) if way.separate else 1
-            noise = median(power) * added / window_gain(known)
+            noise = float(np.median(power)) * added / window_gain(known)
             rows = np.flatnonzero(above.any(axis=1))
             sparse, recovered = advise(spectra, rows, noise, known)
         above = way.keep(above, Levels(power, level, recovered), known)

@@ -15,7 +15,6 @@ import numpy as np
 from scipy import ndimage
 
 from isac_rt.kernels.hermitian import inverses
-from isac_rt.kernels.order import median
 from isac_rt.receive.arms import all_channels, both_arms
 from isac_rt.receive.cfar import (
     CfarRule,
@@ -322,7 +321,7 @@ def noise_level(power: np.ndarray, expected: np.ndarray | None, looks: int) -> f
     The median of a mean of n exponentials is (1 - 1/(9 n))^3 of its mean (Wilson and Hilferty).
     """
     some = power if expected is None else power[expected <= np.quantile(expected, QUIET)]
-    return median(some) / (1 - 1 / (9 * looks)) ** 3
+    return float(np.median(some)) / (1 - 1 / (9 * looks)) ** 3
 
 
 def arms_of(known: Known) -> np.ndarray:

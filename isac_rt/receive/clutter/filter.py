@@ -22,7 +22,6 @@ from scipy import special
 
 from isac_rt.frame.schedule import Schedule
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.order import medians
 from isac_rt.receive.transform import transform
 
 GAP = 3
@@ -72,7 +71,7 @@ def runs(power: np.ndarray, looks: float, least: int) -> np.ndarray:
     inside : as `power`, bool
     """
     lines = power.reshape(-1, power.shape[-1])
-    floor = medians(lines)[:, None]
+    floor = np.median(lines, axis=1, keepdims=True)
     inside = np.zeros(lines.shape, bool)
     _mark(lines > occupied_factor(looks) * floor, least, inside)
     return inside.reshape(power.shape)

@@ -21,7 +21,6 @@ from isac_rt.frame.payload import by_antenna, demodulate_bits, gray_bits, runnin
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.order import median
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.clutter.filter import chirp_runs
 from isac_rt.receive.spectrum import tones
@@ -182,8 +181,8 @@ def _likelihood(spectra: np.ndarray) -> tuple[float, float, np.ndarray]:
     """Noise power of a cell, SNR of the path's cell, and the log likelihood of each cell (M, P, S)
     as the path's, its phase unknown: ln I_0(2 sqrt(g E / N)) with E the cell's power."""
     power = np.abs(spectra) ** 2
-    noise = max(median(power) / np.log(2), 1e-300)
-    snr = max(median(power.max(axis=-1)) / noise - 1, 1e-3)
+    noise = max(float(np.median(power)) / np.log(2), 1e-300)
+    snr = max(float(np.median(power.max(axis=-1))) / noise - 1, 1e-3)
     x = 2 * np.sqrt(snr * power / noise)
     likelihood = np.empty_like(x)
     _log_bessel(x.reshape(-1), *_table(), likelihood.reshape(-1))

@@ -27,7 +27,6 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import by_antenna, demodulate_bits, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.kernels.order import median
 from isac_rt.kernels.vector import new_memory
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.symbols.beams import rate_error, transitions_of
@@ -153,7 +152,7 @@ def find_peaks(cube: IFCube, time: float, modulated: bool) -> Peaks:
         for h in (0, 1):
             transform(cube.samples[m], factors[h], fast, spectra[h], power=power[h])
         dense = power.transpose(1, 2, 0).reshape(chirps, 2 * size)
-        noise[m] = median(dense) / gammaincinv(num_rx, 0.5)
+        noise[m] = float(np.median(dense)) / gammaincinv(num_rx, 0.5)
         left = dense.copy()
         for k in range(PEAKS):
             at = left.argmax(axis=1)
