@@ -16,13 +16,14 @@ import ctypes
 import errno
 import functools
 import gc
+import importlib
 import importlib.metadata
 import os
 import re
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,6 +62,7 @@ FREED_IS_KEPT = {-8: 1, -3: 1 << 30, -1: (1 << 31) - 1}
 """M_ARENA_MAX, M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of glibc's mallopt: memory that one array has
 left is there for the next, in whatever thread, and does not go back to the system, which clears
 pages before it gives them out (2 % of a run's processor time)."""
+_NUMBA_CONFIG = ".numba_config.yaml"
 _OF_THE_NAME = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG)
 """Numbers of errors that are of the file which was asked for, and not of the machine."""
 _NO_MORE = re.compile("out of memory|can't start new thread", re.IGNORECASE)
@@ -80,6 +82,27 @@ def settle_process() -> None:
     os.environ.setdefault(*LINEAR_ALGEBRA)
     for parameter, value in FREED_IS_KEPT.items():
         _ask_glibc("mallopt", parameter, value)
+
+
+def shut_out_working_folder() -> None:
+    """Keep files of the working folder, which may be a stranger's, from setting libraries up; for a
+    process of its own, before it starts threads.
+
+    matplotlib reads `matplotlibrc` once, when it is imported; numba reads `.numba_config.yaml`
+    whenever it compiles.
+
+    Raises
+    ------
+    UserError  If there is a file for numba.
+    """
+    if os.path.lexists(_NUMBA_CONFIG):
+        raise UserError(
+            f"{_NUMBA_CONFIG} in the working folder would set up the compiler; work in another "
+            "folder or remove it (what is yours may stand in NUMBA_... of the environment)"
+        )
+    if os.path.lexists("matplotlibrc"):
+        with chdir("/"):
+            importlib.import_module("matplotlib")
 
 
 def _ask_glibc(function: str, *arguments: int) -> None:
@@ -385,6 +408,9 @@ def activate() -> Backend:
             f"{' or '.join(VARIANTS.values())}; "
             "call isac_rt.runtime.activate() before anything else sets a variant"
         )
+    resolver = mi.file_resolver()  # which looks for libraries in the working folder first
+    resolver.clear()
+    resolver.append(str(Path(mi.__file__).parent))
     return backend
 
 

@@ -24,7 +24,7 @@ from isac_rt import registry
 from isac_rt.cli import captures, setting_up, simulation, studies, sweeps
 from isac_rt.cli.console import err
 from isac_rt.cli.interruption import Terminated, say_interrupted
-from isac_rt.runtime import UserError, of_machine, settle_process
+from isac_rt.runtime import UserError, of_machine, settle_process, shut_out_working_folder
 
 DEBUG = "ISAC_RT_DEBUG"
 COMMANDS: dict[Callable[..., None], str] = {
@@ -129,6 +129,7 @@ def _main(arguments: Sequence[str]) -> int:
     settle_process()
     warnings.showwarning = _say_warning  # type: ignore[assignment]  # fewer arguments, by *_
     try:
+        shut_out_working_folder()
         status = app(
             args=captures.with_standard_output(list(arguments)),
             prog_name="isac-rt",
