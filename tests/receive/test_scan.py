@@ -13,7 +13,6 @@ from isac_rt.receive.arms import all_channels
 from isac_rt.receive.clutter import bistatic
 from isac_rt.receive.clutter.coherent import Search, denominators, search_plain
 from isac_rt.receive.clutter.scan import (
-    axis_bounds,
     line_bounds,
     search_by_power,
     search_coherent,
@@ -43,21 +42,6 @@ def test_bounds_are_the_largest_power_over_a_lines_directions(cells: int):
 def coherent_search(antennas) -> Search:
     known = Known.unmodulated(Waveform(), np.zeros((1, 120), int), antennas, 2)
     return Search.of(all_channels(antennas), known.wavenumber, antennas.view_limit)
-
-
-@pytest.mark.parametrize("cells", [5, 64, 83])
-def test_bounds_of_an_axis_are_the_largest_sum_over_its_lines(cells: int):
-    """Both axes of an L. Planted bugs: powers of the lines added; each line in its own best
-    direction; channels in another order; the last cells left out."""
-    search, rng = coherent_search(ANTENNAS), np.random.default_rng(6)
-    x = noise(rng, len(search.channels), cells)
-    order, *axes = search.axes
-    parts = np.split(order, [axes[0].ends[-1]])
-    for lines, axis, part in zip((search.along_x, search.along_z), axes, parts, strict=True):
-        each = [np.abs(s @ x[m]) for m, s in zip(lines.members, lines.spectra, strict=True)]
-        assert len(each) == 2
-        expected = sum(each).max(axis=0)
-        np.testing.assert_allclose(axis_bounds(x, part, axis), expected, rtol=ROUNDING)
 
 
 def test_the_bounds_of_the_coherent_search_miss_nothing():

@@ -34,7 +34,6 @@ from isac_rt.receive.arms import Channels, all_channels, both_arms
 from isac_rt.receive.clutter.power import REACH, Taper, cells_of, range_power, slow_power
 from isac_rt.receive.clutter.scan import (
     Axis,
-    axis_bounds,
     line_bounds,
     quadratic_forms,
     search_coherent,
@@ -211,7 +210,7 @@ def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -
     maps : (L_tx, L_rx, rows, P) complex64 of `channel_maps`
     noise : mean power of a cell of one channel
     """
-    c, (order, along_x, along_z) = search.channels, search.axes
+    c = search.channels
     x = maps.reshape(-1, maps.shape[2] * maps.shape[3])
     channel = c.tx * maps.shape[1] + c.rx
     scale = 1 / (len(c) * noise)
@@ -222,13 +221,12 @@ def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -
         for members, spectra in zip(lines.members, lines.spectra, strict=True):
             bound += np.sqrt(line_bounds(x, channel[members][None], spectra))
     cell = np.flatnonzero(bound**2 * raised >= least)
-    x = np.take(x, cell, axis=1)
+    x = np.ascontiguousarray(x[channel[:, None], cell])
     # of each line the best direction, then of all lines along an axis one
-    on_x, on_z = np.split(channel[order], [along_x.ends[-1]])
-    bound = axis_bounds(x, on_x, along_x) + axis_bounds(x, on_z, along_z)
-    peak, cosines = bound**2 * raised, np.full((cell.size, 2), np.nan)
+    best = [np.sqrt(f.real**2 + f.imag**2).sum(axis=0).max(axis=0) for f in search.lines(x)]
+    peak, cosines = (best[0] + best[1]) ** 2 * raised, np.full((cell.size, 2), np.nan)
     some = np.flatnonzero(peak >= least)
-    y = np.ascontiguousarray(x[channel[:, None], some].T)
+    y = np.ascontiguousarray(x[:, some].T)
     whole = np.full((1, DIRECTIONS, DIRECTIONS), scale)
     peak[some], cosines[some] = _whitened(y, whole, search)
     above = peak[some] >= least

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import LANES, evens, larger, load, odds, root, splat, store, transpose
+from isac_rt.kernels.vector import LANES, evens, larger, load, odds, splat, store, transpose
 
 
 def line_bounds(maps: np.ndarray, channels: np.ndarray, spectra: np.ndarray) -> np.ndarray:
@@ -70,38 +70,6 @@ def _line_bounds(maps, channels, cosines, sines, out):
                 one = one + re_1 * re_1 + im_1 * im_1
                 other = other + re_2 * re_2 + im_2 * im_2
             largest = larger(largest, larger(one, other))
-        store(out, first, largest)
-
-
-def axis_bounds(maps: np.ndarray, channels: np.ndarray, axis: Axis) -> np.ndarray:
-    """(S,) largest sum of the amplitudes that the lines along an axis have in one of its
-    directions, of each cell of `maps` (C, S) complex64; `channels` (n,) are numbers of the lines'
-    channels, line by line."""
-    floats = _whole_vectors(maps)
-    out = np.empty(floats.shape[1] // 2, np.float32)
-    _axis_bounds(floats, channels, axis.ends, axis.cosines, axis.sines, out)
-    return out[: maps.shape[1]]
-
-
-@jit
-def _axis_bounds(maps, channels, ends, cosines, sines, out):
-    """`axis_bounds`; complex maps as real and imaginary parts in turn."""
-    width, flat, zero = maps.shape[1], maps.reshape(-1), splat(np.float32(0))
-    heard = np.empty(2 * LANES * channels.size, np.float32)
-    for first in range(0, out.size, LANES):
-        for e in range(channels.size):
-            _hear(flat, channels[e] * width + 2 * first, 2 * LANES * e, heard)
-        largest = zero
-        for g in range(len(cosines)):
-            total = zero
-            for line in range(ends.size - 1):
-                re, im = zero, zero
-                for e in range(ends[line], ends[line + 1]):
-                    a, b = load(heard, 2 * LANES * e), load(heard, 2 * LANES * e + LANES)
-                    c, s = splat(cosines[g, e]), splat(sines[g, e])
-                    re, im = re + c * a - s * b, im + c * b + s * a
-                total = total + root(re * re + im * im)
-            largest = larger(largest, total)
         store(out, first, largest)
 
 
