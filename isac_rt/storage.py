@@ -15,15 +15,18 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import grp
 import hashlib
 import importlib.metadata
 import json
 import math
 import os
 import platform
+import pwd
 import re
 import secrets
 import stat
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -67,6 +70,7 @@ PACKAGES = (
     "pydantic",
 )
 """What a number of a result, or the file that holds it, can depend on."""
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{1,8}\.tmp")
 _UNSYNCED = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
 """What file systems answer that cannot sync a folder."""
@@ -75,6 +79,64 @@ _in_work: set[Path] = set()
 
 class StorageError(MachineProblem):
     """A file cannot be written; the text says why and what to do."""
+
+
+class CacheWarning(UserWarning):
+    """A folder of what earlier runs prepared is not used."""
+
+
+@lru_cache
+def is_own_folder(folder: Path) -> bool:
+    """Whether only this user, or root, can put files into a folder or another folder in its place;
+    a warning says why not.
+
+    The folder and all above it are looked at, with links and without; a folder above may be one
+    that others write where each can remove only their own, as `/tmp`.
+    """
+    named, real = Path(os.path.abspath(folder)), Path(os.path.realpath(folder))
+    for place in dict.fromkeys([named, *named.parents, real, *real.parents]):
+        fault = _fault_of(place, place in (named, real))
+        if fault is not None:
+            warnings.warn(
+                CacheWarning(
+                    f"{folder} is not used: {place} {fault}, who could plant files there; "
+                    "chmod it, or name a folder of your own"
+                ),
+                stacklevel=2,
+            )
+            return False
+    return True
+
+
+def _fault_of(place: Path, is_last: bool) -> str | None:
+    """Who else may write a folder; None if nobody."""
+    status = os.lstat(place)
+    if status.st_uid not in (os.geteuid(), 0) and place != Path(place.anchor):
+        return f"belongs to {_name_of(status.st_uid)}"
+    if stat.S_ISLNK(status.st_mode):
+        return None
+    open_to = status.st_mode & _OTHERS_WRITE
+    if open_to and status.st_mode & stat.S_ISVTX and not is_last:
+        return None
+    if open_to == stat.S_IWGRP and _is_private_group(status.st_gid):
+        return None
+    return "may be written by others" if open_to else None
+
+
+def _name_of(user: int) -> str:
+    try:
+        return pwd.getpwuid(user).pw_name
+    except KeyError:
+        return f"user {user}"
+
+
+def _is_private_group(group: int) -> bool:
+    """Whether a group is this user's alone, as many systems give to each."""
+    try:
+        user, found = pwd.getpwuid(os.geteuid()), grp.getgrgid(group)
+    except KeyError:
+        return False
+    return found.gr_name == user.pw_name and set(found.gr_mem) <= {user.pw_name}
 
 
 def write_whole(file: str | Path, content: bytes | str) -> None:
@@ -251,6 +313,12 @@ def kept(what: str, depends_on: Any, make: Callable[[], Any]) -> Any:
             return make()
         named = str(user / "isac_rt" / "kept")
     if not named:
+        return make()
+    try:
+        Path(named).mkdir(parents=True, exist_ok=True)
+        if not is_own_folder(Path(named)):
+            return make()
+    except OSError:
         return make()
     store = Store(Path(named), ".data", KEPT_BYTES)
     tree, arrays = pack([what, depends_on, program_fingerprint(), versions()])

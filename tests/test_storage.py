@@ -9,6 +9,7 @@ import resource
 import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -238,6 +239,21 @@ def test_what_is_kept_is_found_by_all_that_it_depends_on(tmp_path, monkeypatch):
     for folder in ("", str(tmp_path / "file" / "below")):
         monkeypatch.setenv(storage.KEPT, folder)
         assert storage.kept("x", ["y", np.arange(3)], make)["n"] == len(made)
+
+
+def test_what_others_could_have_kept_is_not_taken(tmp_path, monkeypatch):
+    """A checksum is no signature: who may write there could keep wrong numbers under a right one.
+    Planted bug: a group of many taken for one's own."""
+    folder = tmp_path / "kept"
+    monkeypatch.setenv(storage.KEPT, str(folder))
+    assert storage.kept("x", "y", lambda: 1) == 1
+    assert storage.kept("x", "y", lambda: 2) == 1
+    for mode, private, taken in ((0o777, True, False), (0o775, False, False), (0o775, True, True)):
+        storage.is_own_folder.cache_clear()
+        folder.chmod(mode)
+        monkeypatch.setattr(storage, "_is_private_group", lambda group, own=private: own)
+        with nullcontext() if taken else pytest.warns(storage.CacheWarning, match="by others"):
+            assert storage.kept("x", "y", lambda: 2) == (1 if taken else 2)
 
 
 def test_a_store_keeps_to_its_limit_and_lets_the_oldest_go(tmp_path):

@@ -26,6 +26,8 @@ from llvmlite import binding
 from numba.core import caching, codegen
 from numba.core.runtime.nrt import rtsys
 
+from isac_rt.storage import is_own_folder
+
 _LOG = logging.getLogger(__name__)
 CACHE = "ISAC_RT_CACHE"
 """Variable of the environment: folder of the machine code."""
@@ -149,7 +151,8 @@ def _needed(path: Path) -> list[Path]:
 
 @lru_cache
 def cache_folder(module: str) -> Path | None:
-    """Folder of a module's machine code, made if need be; None where none can be written.
+    """Folder of a module's machine code, made if need be; None where none can be written, or others
+    can write it: what lies there is run.
 
     Those of other sources of the module are removed but for the last used.
     """
@@ -159,6 +162,8 @@ def cache_folder(module: str) -> Path | None:
         user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "isac_rt"
         folder = (Path(named) if named else user) / f"{short}-{digest(module)}"
         folder.mkdir(parents=True, exist_ok=True)
+        if not is_own_folder(folder.parent) or not is_own_folder(folder):
+            return None
         tempfile.TemporaryFile(dir=folder).close()  # which also says that it was used today
         others = sorted(folder.parent.glob(f"{short}-*"), key=lambda f: f.stat().st_mtime)
     except (OSError, RuntimeError):

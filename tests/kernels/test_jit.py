@@ -183,6 +183,35 @@ def test_where_nothing_can_be_written_every_process_compiles(copy):
     assert run(copy, ISAC_RT_CACHE=str(copy / "file")) == ["21001", "0"]
 
 
+@pytest.mark.parametrize("way", ["others write it", "others write above", "of another", "linked"])
+def test_machine_code_that_others_could_plant_is_not_run(way, copy):
+    """Planted bug: only the folder itself is looked at; links are not followed."""
+    above = copy / "above"
+    cache = above / "cache"
+    cache.mkdir(parents=True)
+    assert run(copy, ISAC_RT_CACHE=str(cache)) == ["21001", "0"]
+    assert run(copy, ISAC_RT_CACHE=str(cache)) == ["21001", "1"]
+    if way == "others write it":
+        cache.chmod(0o1777)
+    elif way == "others write above":
+        above.chmod(0o777)
+    elif os.geteuid():
+        pytest.skip("only root gives a folder to another")
+    else:
+        os.chown(above, 12345, -1)
+    if way == "linked":
+        (copy / "link").symlink_to(cache)
+        cache = copy / "link"
+    assert run(copy, ISAC_RT_CACHE=str(cache)) == ["21001", "0"]
+
+
+def test_a_folder_in_one_that_all_share_as_tmp_is_used(copy):
+    (copy / "shared").mkdir()
+    (copy / "shared").chmod(0o1777)
+    assert run(copy, ISAC_RT_CACHE=str(copy / "shared/own")) == ["21001", "0"]
+    assert run(copy, ISAC_RT_CACHE=str(copy / "shared/own")) == ["21001", "1"]
+
+
 def test_old_machine_code_goes(copy):
     """Of twelve sources of a module the eight last used stay."""
     for number in range(11):
