@@ -12,9 +12,6 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from pydantic import GetJsonSchemaHandler
-from pydantic_core import CoreSchema, core_schema
-
 from isac_rt.runtime import UserError
 
 
@@ -66,13 +63,13 @@ class Registry:
                 f"{type(problem).__name__}: {problem}; mend or uninstall {source}"
             ) from problem
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Check that a setting names a part; for `Annotated[str, REGISTRY]`."""
+        from pydantic_core import core_schema  # the command line's help needs none of it
+
         return core_schema.no_info_after_validator_function(self._checked, handler(source))
 
-    def __get_pydantic_json_schema__(
-        self, schema: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
         return {"type": "string", "enum": self.names()}
 
     def _checked(self, name: str) -> str:

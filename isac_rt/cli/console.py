@@ -88,7 +88,6 @@ def with_progress(work: Callable[[Report], Any], what: str, steps: int | None = 
         Progress,
         TextColumn,
         TimeElapsedColumn,
-        TimeRemainingColumn,
     )
 
     if not err().is_terminal:
@@ -100,17 +99,48 @@ def with_progress(work: Callable[[Report], Any], what: str, steps: int | None = 
         MofNCompleteColumn(),
         TextColumn("{task.fields[note]}", markup=False),
         TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
+        TextColumn("{task.fields[left]}", markup=False),
     )
     with Progress(*columns, console=err()) as bar:
-        task = bar.add_task(what, total=steps, note="")
+        task, pace = bar.add_task(what, total=steps, note="", left=""), _Pace()
 
         def report(done: int, total: int | None, note: str = "") -> None:
-            bar.update(task, completed=done, total=total, note=note)
+            pace.move(done)
+            bar.update(task, completed=done, total=total, note=note, left=pace.left(total))
 
-        with _logged(lambda step: bar.update(task, note=step)):
+        def step(text: str) -> None:
+            pace.interrupt()
+            bar.update(task, note=text)
+
+        with _logged(step):
             return work(report)
+
+
+class _Pace:
+    """The time left, from what was done since the last logged step: what took its time once, such
+    as compiling, says nothing of the rest."""
+
+    def __init__(self) -> None:
+        self._begun: tuple[int, float] | None = None
+        self._done = 0
+
+    def interrupt(self) -> None:
+        """Begin anew with the next part that is done."""
+        self._begun = None
+
+    def move(self, done: int) -> None:
+        """Take up that so many parts are done."""
+        self._done = done
+        if self._begun is None:
+            self._begun = done, time.monotonic()
+
+    def left(self, total: int | None) -> str:
+        """The time left in words; empty where nothing was done without interruption."""
+        if self._begun is None or not total or not self._begun[0] < self._done < total:
+            return ""
+        first, since = self._begun
+        seconds = (time.monotonic() - since) * (total - self._done) / (self._done - first)
+        return f"about {seconds:.0f} s left"
 
 
 class _Lines:
@@ -119,7 +149,7 @@ class _Lines:
 
     def __init__(self, what: str, total: int | None = None) -> None:
         self._what, self._done, self._total, self._step = what, 0, total, ""
-        self._begun, self._lock = time.monotonic(), threading.Lock()
+        self._begun, self._lock, self._pace = time.monotonic(), threading.Lock(), _Pace()
         self._ended = threading.Event()
         self._repeat = threading.Thread(target=self._go_on, daemon=True)
 
@@ -137,12 +167,14 @@ class _Lines:
         if step == self._step:
             return
         self._step = step
+        self._pace.interrupt()
         if time.monotonic() - self._said >= SOON_S:
             self._say()
 
     def move(self, done: int, total: int | None, note: str = "") -> None:
         """So much is done; the end is said at once."""
         self._done, self._total, self._step = done, total, note
+        self._pace.move(done)
         if done == total:
             self._say()
 
@@ -158,9 +190,7 @@ class _Lines:
             parts = [f"{self._done} of {self._total}"] if self._total else []
             parts += [self._step] if self._step else []
             parts += [f"{passed:.0f} s"] if passed >= 1 else []
-            if self._total and 0 < self._done < self._total:
-                left = passed * (self._total - self._done) / self._done
-                parts.append(f"about {left:.0f} s left")
+            parts += [left] if (left := self._pace.left(self._total)) else []
             said = f"{self._what}: {', '.join(parts)}" if parts else self._what
             err().print(said, soft_wrap=True)
 

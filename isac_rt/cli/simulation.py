@@ -81,6 +81,7 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
 
     check_folder(folder)
     with working("loading the program"):
+        from isac_rt.kernels.jit import compilations_logged, use_whole_registers
         from isac_rt.results.provenance import run_content
         from isac_rt.simulation import simulate
         from isac_rt.simulation.resume import Resume
@@ -88,11 +89,12 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
         from isac_rt.world.area import city_digest
 
         city = city_digest(loaded.city, loaded.folder)
+    use_whole_registers()
     resume = Resume(folder, run_content(loaded, snapshots, city))
     if restart:
         resume.remove()
     resume.check()
-    with working("setting up"):
+    with compilations_logged(), working("setting up"):
         setup = prepare(loaded, digest=city)
         budget = link_budgets(setup)
     _say_city(setup.city.notes)
@@ -107,9 +109,10 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
             if done < total:  # while receivers are at work
                 _drawing()
 
-        return simulate.run(
-            loaded, setup=setup, progress=progress, snapshots=snapshots, resume=resume
-        )
+        with compilations_logged():
+            return simulate.run(
+                loaded, setup=setup, progress=progress, snapshots=snapshots, resume=resume
+            )
 
     results = with_progress(simulated, "frames", loaded.frames)
     if check_budget:

@@ -16,15 +16,15 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numba
 from llvmlite import binding
-from numba.core import caching, codegen
-from numba.core.runtime.nrt import rtsys
+from numba.core import caching, event
 
 from isac_rt.storage import is_own_folder
 
@@ -42,11 +42,42 @@ _WORD = re.compile(rb"\w+")
 
 AVX512 = bool(binding.get_host_cpu_features().get("avx512f"))
 """Whether a register holds sixteen float32 here."""
-_CONFIG: Any = numba.config
-if _CONFIG.CPU_FEATURES is None and AVX512:
-    # loops take whole registers: LLVM takes half of one on Intel's processors, for the clock rates
-    # of the first that had AVX-512
-    _CONFIG.CPU_FEATURES = f"{codegen.get_host_cpu_features()},-prefer-256-bit"
+
+
+def use_whole_registers() -> None:
+    """Let loops take whole AVX-512 registers, which LLVM halves for the first processors that had
+    them: 6 % of a run's processor time, the same bits.
+
+    For a process of its own, before its first kernel: it is a setting of numba as a whole.
+    """
+    config: Any = numba.config
+    if AVX512 and config.CPU_FEATURES is None:
+        features = binding.get_host_cpu_features().flatten()
+        config.CPU_FEATURES = f"{features},-prefer-256-bit"
+
+
+class _Counter(event.Listener):
+    """Logs how many kernels were compiled, which later runs need not."""
+
+    def __init__(self) -> None:
+        self.compiled = 0
+
+    def on_start(self, compiling: event.Event) -> None:
+        kernel = compiling.data["dispatcher"].py_func
+        if kernel.__module__.startswith("isac_rt."):
+            self.compiled += 1
+            _LOG.info("compiling for this machine, kernel %d", self.compiled)
+
+    def on_end(self, compiled: event.Event) -> None:
+        pass
+
+
+_COUNTER = _Counter()
+
+
+def compilations_logged() -> AbstractContextManager[None]:
+    """Log the count of kernels that this process compiled, as it grows meanwhile."""
+    return event.install_listener("numba:compile", _COUNTER)
 
 
 def jit(
@@ -69,16 +100,15 @@ def jit(
     if function is None:
         return partial(jit, fast=fast, inline=inline, borrows=borrows)
     compiled: Any = numba.njit  # whose stubs do not know `_nrt`
-    made = compiled(
-        nogil=True,
-        error_model="numpy",
-        fastmath=set(FAST) if fast else False,
-        inline="always" if inline else "never",
-        _nrt=not borrows,
-    )(function)
-    if not inline and cache_folder(function.__module__) is not None:
-        made._cache = _Cache(function)
-    return made
+    with _located():
+        return compiled(
+            nogil=True,
+            error_model="numpy",
+            fastmath=set(FAST) if fast else False,
+            inline="always" if inline else "never",
+            cache=not inline and cache_folder(function.__module__) is not None,
+            _nrt=not borrows,
+        )(function)
 
 
 TWINS_ONLY = os.environ.get("ISAC_RT_KERNELS") == "0"
@@ -173,8 +203,8 @@ def cache_folder(module: str) -> Path | None:
     return folder
 
 
-class _Locator(caching._CacheLocator):
-    """Says where numba keeps a function's machine code."""
+class Locator(caching._CacheLocator):
+    """Says where numba keeps a function's machine code, by its setting `CACHE_LOCATOR_CLASSES`."""
 
     def __init__(self, function: Callable) -> None:
         self._function = function
@@ -189,39 +219,17 @@ class _Locator(caching._CacheLocator):
         return str(self._function.__code__.co_firstlineno)
 
     @classmethod
-    def from_function(cls, py_func: Callable, py_file: str) -> _Locator:
+    def from_function(cls, py_func: Callable, py_file: str) -> Locator:
         return cls(py_func)
 
 
-class _Implementation(caching.CompileResultCacheImpl):
-    _locator_classes: Any = (_Locator,)
-
-    def rebuild(self, target_context: Any, payload: Any) -> Any:
-        """The compiled function as it was kept, but for its bitcode, which only functions that are
-        compiled anew and call it ask for: reading it takes three quarters of the time. In its place
-        stands a module that names what the machine code defines."""
-        try:
-            (name, kind, (code, bitcode)), described, *rest = payload
-            defined = described.llvm_func_name, described.llvm_cpython_wrapper_name
-        except (AttributeError, TypeError, ValueError):  # as a later numba may keep it
-            return super().rebuild(target_context, payload)
-        text = "".join(f'define void @"{symbol}"() {{ ret void }}\n' for symbol in defined)
-        named = binding.parse_assembly(text).as_bitcode()
-        kept = (name, kind, (code, named)), described, *rest
-        made = super().rebuild(target_context, kept)
-        made.library._get_module_for_linking = cache(lambda: binding.parse_bitcode(bitcode))
-        return made
-
-
-class _Cache(caching.Cache):
-    _impl_class: Any = _Implementation
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The machine code for a signature; None where it is to be compiled, which is logged.
-
-        Of what numba loads before it compiles, 0.15 s, machine code needs the memory of arrays."""
-        rtsys.initialize(target_context)
-        found = self._load_overload(sig, target_context)
-        if found is None:
-            _LOG.info("compiling for this machine, which later runs need not")
-        return found
+@contextmanager
+def _located() -> Iterator[None]:
+    """Have numba ask `Locator` alone for the places of what is decorated meanwhile."""
+    config: Any = numba.config
+    before = config.CACHE_LOCATOR_CLASSES
+    config.CACHE_LOCATOR_CLASSES = f"{Locator.__module__}.{Locator.__qualname__}"
+    try:
+        yield
+    finally:
+        config.CACHE_LOCATOR_CLASSES = before

@@ -314,8 +314,10 @@ def test_where_no_terminal_shows_a_bar_lines_come(capsys, monkeypatch):
         time.sleep(0.2)
         logging.getLogger("isac_rt.world").info("reading the %s", "city")
         time.sleep(1.0)
+        report(2, 4)
+        time.sleep(0.6)
         report(3, 4)
-        time.sleep(0.5)
+        time.sleep(0.6)
         report(4, 4)
 
     console.with_progress(work, "frames", 4)
@@ -324,6 +326,8 @@ def test_where_no_terminal_shows_a_bar_lines_come(capsys, monkeypatch):
     assert texts[1] == "frames: 0 of 4, reading the city" and times[1] < 0.35
     assert max(np.diff(times)) < 0.4 + 0.2  # and the scheduler
     assert any(re.fullmatch(r"frames: 3 of 4, \d s, about \d s left", text) for text in texts)
+    # the first part after a logged step says nothing of the rest
+    assert not any("2 of 4" in text and "left" in text for text in texts)
     assert texts[-1].startswith("frames: 4 of 4")
     said.clear()
     with console.working("setting up"):
