@@ -14,7 +14,8 @@ from functools import lru_cache
 import numpy as np
 from scipy import optimize, special
 
-from isac_rt.kernels.jit import jit
+from isac_rt.kernels import receive_maps
+from isac_rt.kernels.jit import twin_of
 from isac_rt.receive.settings import Receivers
 
 HANN_CORRELATION = ((2 / 3) ** 2, (1 / 6) ** 2)
@@ -32,6 +33,8 @@ cells around them."""
 DEEPEST_LOBE = 1e-8
 """Lobes are followed down to this share of their peak, 15 cells out; without noise they would fill
 the map."""
+LOBE_MARGIN = 4.0
+"""Power over the bound of a stronger path's sidelobes from which on a peak is one."""
 LEAST_KEPT = 0.25
 """Share of a training block that must be left for its mean to count."""
 
@@ -119,7 +122,8 @@ class CfarRule:
         both do."""
         out = np.empty(power.shape)
         half = self.guard[1] + self.training[1]
-        _background(power, keep, self.side_rows(len(power)), self.guard[0], half, out)
+        sides = self.side_rows(len(power))
+        fill_background(power, keep, sides, self.guard[0], half, LEAST_KEPT, out)
         return out
 
     def side_rows(self, rows: int) -> np.ndarray:
@@ -184,38 +188,32 @@ def greatest_of_factor(
     return float(optimize.brentq(excess, 0.5, 1000.0, xtol=1e-6))
 
 
-@jit
-def _background(power, keep, sides, guard, half, out):
-    """`CfarRule.background`, with `half` a block's bins on each side."""
-    num_rows, num_bins = power.shape
-    # sums of the first 0, 1, ... rows over the bins about each
-    total = np.zeros((num_rows + 1, num_bins))
-    held = np.zeros((num_rows + 1, num_bins), np.int64)
-    for r in range(num_rows):
-        value, count = 0.0, 0
-        for p in range(-half, num_bins + half):
-            if keep[r, p % num_bins]:
-                value += power[r, p % num_bins]
-                count += 1
-            if p >= half:
-                total[r + 1, p - half] = total[r, p - half] + value
-                held[r + 1, p - half] = held[r, p - half] + count
-                last = (p - 2 * half) % num_bins
-                if keep[r, last]:
-                    value -= power[r, last]
-                    count -= 1
-    for r in range(num_rows):
-        for p in range(num_bins):
-            level = -np.inf
-            for side in range(2):
-                rows = sides[r, side]
-                first = r + guard + 1 if side else r - guard - rows
-                if rows > 0:
-                    cells = held[first + rows, p] - held[first, p]
-                    if cells >= LEAST_KEPT * rows * (2 * half + 1):
-                        mean = (total[first + rows, p] - total[first, p]) / max(cells, 1)
-                        level = max(level, mean)
-            out[r, p] = level if level > -np.inf else np.inf
+@twin_of(receive_maps.background)
+def fill_background(
+    power: np.ndarray,
+    keep: np.ndarray,
+    sides: np.ndarray,
+    guard: int,
+    half: int,
+    least: float,
+    out: np.ndarray,
+) -> None:
+    """Fill the background of each cell (`CfarRule.background`) of `power` (rows, P) from the cells
+    to `keep`, in blocks of `sides` rows (rows, 2) beyond the `guard` and `half` bins on each side;
+    `least` share of a block must be kept."""
+    row, wide = np.arange(len(power)), 2 * half + 1
+    bins = np.arange(-half, power.shape[1] + half) % power.shape[1]
+    kept = np.stack([np.where(keep, power, 0.0), keep]).astype(float)[..., bins]
+    about = np.lib.stride_tricks.sliding_window_view(kept, wide, axis=2).sum(axis=3)
+    sums = np.pad(np.cumsum(about, axis=1), ((0, 0), (1, 0), (0, 0)))  # of the first 0, 1, ... rows
+    before, behind = sides.T
+    out[:] = -np.inf
+    for first, rows in ((row - guard - before, before), (row + guard + 1, behind)):
+        first = np.clip(first, 0, len(power))  # a side without rows may begin outside
+        total, cells = sums[:, first + rows] - sums[:, first]
+        held = (cells >= least * rows[:, None] * wide) & (rows > 0)[:, None]
+        out[:] = np.maximum(out, np.where(held, total / np.maximum(cells, 1), -np.inf))
+    out[out == -np.inf] = np.inf
 
 
 def strong_lobes(power: np.ndarray) -> np.ndarray:
@@ -250,27 +248,13 @@ def peaks(
     """Cells above the threshold that are the largest within `reach` (range, Doppler); Doppler
     wraps. Strongest first."""
     rows, bins = np.nonzero(above)
-    keep = _largest(power, rows, bins, *reach)
+    near = (np.arange(-r, r + 1) for r in reach)
+    along, across = (at[:, None] + n for at, n in zip((rows, bins), near, strict=True))
+    along, across = np.clip(along, 0, len(power) - 1), across % power.shape[1]
+    keep = power[along[:, :, None], across[:, None]].max(axis=(1, 2)) <= power[rows, bins]
     rows, bins = rows[keep], bins[keep]
     order = np.argsort(-power[rows, bins], kind="stable")
     return rows[order], bins[order]
-
-
-@jit
-def _largest(power, rows, bins, along, across):
-    """Whether nothing within reach is larger, of each cell."""
-    num_rows, num_bins = power.shape
-    out = np.ones(rows.size, np.bool_)
-    for i in range(rows.size):
-        value = power[rows[i], bins[i]]
-        for r in range(max(rows[i] - along, 0), min(rows[i] + along + 1, num_rows)):
-            for b in range(bins[i] - across, bins[i] + across + 1):
-                if power[r, b % num_bins] > value:
-                    out[i] = False
-                    break
-            if not out[i]:
-                break
-    return out
 
 
 def strongest_peaks(
@@ -304,7 +288,7 @@ def without_sidelobes(
     power: np.ndarray,
     num_bins: int,
     floor: float,
-    margin: float = 4.0,
+    margin: float = LOBE_MARGIN,
 ) -> np.ndarray:
     """Which peaks (strongest first) are more than what a stronger one leaves around it.
 
@@ -313,27 +297,17 @@ def without_sidelobes(
     floor : share of a path's power that may lie in any Doppler bin of its range row
     margin : power factor above the bound
     """
-    kept: np.ndarray = _stand_out(rows, bins, power[rows, bins], num_bins, floor, margin)
-    return kept
-
-
-@jit
-def _stand_out(rows, bins, values, num_bins, floor, margin):
-    """`without_sidelobes`."""
-    keep = np.ones(rows.size, np.bool_)
-    for i in range(rows.size):
-        for k in range(i):
-            if keep[k]:
-                across = abs(bins[i] - bins[k])
-                across = min(across, num_bins - across)
-                bound = margin * values[k] * lobe_bound(abs(rows[i] - rows[k]))
-                if values[i] <= bound * (lobe_bound(across) + floor):
-                    keep[i] = False
-                    break
+    keep, values = np.ones(rows.size, bool), power[rows, bins]
+    for i in range(1, rows.size):
+        over = np.flatnonzero(keep[:i])
+        lobes = leaked(rows[i] - rows[over], bins[i] - bins[over], num_bins, floor)
+        keep[i] = (values[i] > margin * values[over] * lobes).all()
     return keep
 
 
-@jit
-def lobe_bound(d: float) -> float:
-    """`hann_envelope` of one distance of 0 or more."""
-    return 1.0 if d < 2 else 1.0 / (np.pi * d * (d * d - 1.0)) ** 2
+def leaked(rows: np.ndarray, bins: np.ndarray, num_bins: int, floor: float) -> np.ndarray:
+    """Share of a path's power that may lie so many rows and bins from its cell: of its lobes, and
+    `floor` in any bin of its rows."""
+    bins = np.abs(bins)
+    bins = np.minimum(bins, num_bins - bins)
+    return hann_envelope(rows) * (hann_envelope(bins) + floor)

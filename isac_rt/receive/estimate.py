@@ -103,7 +103,8 @@ class LocalSpectra:
         receivers, and over the transmit antennas in phase or in power."""
         self.waveform, self._sent = known.waveform, _sent(known, separate)
         self._beam, self._in_phase = _NO_BEAM if beam is None else beam, in_phase
-        low, count = _rows_about(row, spectra.shape[2])
+        low = max(row - HALF_WIDTH, 0)
+        count = min(row + HALF_WIDTH + 1, spectra.shape[2]) - low
         self._axis = _axis(known.waveform)._replace(first=float(low))
         self._num_rx = spectra.shape[1]
         self._chirps = _room(self._sent, self._num_rx, count)
@@ -179,13 +180,6 @@ def _sent(known: Known, separate: bool) -> _Sent:
     time[:chirps] = known.times.ravel()
     tx = np.ascontiguousarray((known.schedule + own).ravel())
     return _Sent(weight, time, tx, w.num_tx * (w.num_groups if separate else 1))
-
-
-@jit
-def _rows_about(row: int, rows: int) -> tuple[int, int]:
-    """The first range row about a peak, and how many there are of so many rows."""
-    low = max(row - HALF_WIDTH, 0)
-    return low, min(row + HALF_WIDTH + 1, rows) - low
 
 
 class _Chirps(NamedTuple):
@@ -477,22 +471,6 @@ def _newton(powers: np.ndarray, step: float, mixed: float) -> tuple[float, float
     return min(max(down, -most), most), min(max(across, -most), most), hxy
 
 
-@jit
-def _estimated(spectra, antennas, axis, rows, delays, delay_rates, steps, units, room, out, energy):
-    """`LocalSpectra` about each of Q rows, its `climb` from delays and rates, in place, and
-    `_match` there, (Q, ...) floats and energies, which are 0 before."""
-    data, _, blocks, weight, time, tx, tile = room
-    for q in range(rows.size):
-        low, count = _rows_about(rows[q], spectra.shape[2])
-        chirps = _Chirps(data, count, blocks, weight, time, tx, tile)
-        _gather(spectra, low, axis.share, chirps)
-        here = _Axis(*axis[:-1], np.float64(low))
-        way = delays[q], delay_rates[q], steps, units, antennas, np.zeros((0, 0), np.complex128)
-        delays[q], delay_rates[q] = _climb(chirps, here, *way, False)
-        one = slice(q, q + 1)
-        _match(chirps, here, delays[one], delay_rates[one], out[one], energy[one])
-
-
 @dataclass(frozen=True)
 class Estimator:
     """How a peak of the map becomes an estimate: off the grid, or `on_grid` as the centre of its
@@ -502,8 +480,10 @@ class Estimator:
 
     def at(self, local: LocalSpectra, power: np.ndarray, row: int, column: int) -> Estimate:
         """The estimate of a peak of the centred map `power`."""
-        begun, steps = self._begun(power, row, column, local.waveform)
-        return refine(local, *begun, steps)
+        if self.on_grid:
+            w = local.waveform
+            return refine(local, *to_delay(row, column - w.num_chirps // 2, w), ())
+        return refine(local, *start_point(power, row, column, local.waveform))
 
     def at_peaks(
         self,
@@ -516,24 +496,11 @@ class Estimator:
         separate: bool = False,
     ) -> list[Estimate]:
         """Those of all peaks (Q,) in spectra; `separate` as in `LocalSpectra`."""
-        w, sent, num_rx = known.waveform, _sent(known, separate), spectra.shape[1]
-        (delays, rates), steps = self._begun(power, rows, columns, w)
-        energy, room = np.zeros((len(rows), sent.antennas)), _room(sent, num_rx, 2 * HALF_WIDTH + 1)
-        out = np.zeros((len(rows), sent.antennas * 2 * LANES * room.blocks), np.float32)
-        args = rows, delays, rates, np.array(steps), _units(w), room, out, energy
-        _estimated(np.ascontiguousarray(spectra), sent.antennas, _axis(w), *args)
-        channels = _responses(out, energy, num_rx, w.num_tx)
+        spectra = np.ascontiguousarray(spectra)
         return [
-            Estimate(*one) for one in zip(delays.tolist(), rates.tolist(), channels, strict=True)
+            self.at(LocalSpectra(spectra, known, row, separate=separate), power, row, column)
+            for row, column in zip(rows.tolist(), columns.tolist(), strict=True)
         ]
-
-    def _begun(
-        self, power: np.ndarray, row: T, column: T, waveform: Waveform
-    ) -> tuple[tuple[T, T], Sequence[float]]:
-        """Where the search of peaks begins, and its stencils."""
-        if not self.on_grid:
-            return start_point(power, row, column, waveform), STENCILS
-        return to_delay(row, column - waveform.num_chirps // 2, waveform), ()
 
 
 OFF_GRID = Estimator()

@@ -16,24 +16,15 @@ import numpy as np
 from scipy import ndimage
 
 from isac_rt.frame.waveform import Waveform, hann
-from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import (
-    PART,
-    aligned,
-    backwards,
-    load_part,
-    splat_part,
-    store,
-    zip_high,
-    zip_low,
-)
+from isac_rt.kernels import receive_maps
+from isac_rt.kernels.jit import twin_of
+from isac_rt.kernels.receive_maps import ROWS
+from isac_rt.kernels.vector import PART, aligned
 from isac_rt.receive.known import Known
 
 UNION_FLOOR = 1e-5
 """Share of a path's power that the resampling of the united groups may leave in any other Doppler
 bin; reached within 2 % of the unambiguous velocity."""
-_ROWS = 24
-"""Range cells of an antenna, all groups' chirps, that stay in the second-level cache."""
 
 
 def slow_window(waveform: Waveform) -> np.ndarray:
@@ -81,9 +72,9 @@ def _mapped(spectra: np.ndarray, known: Known, maps: np.ndarray) -> np.ndarray:
     ends, places, factors = _operators(known)
     places = 2 * (places[0] * np.uint64(spectra[0].size) + places[1])
     flat = np.ascontiguousarray(spectra).reshape(-1).view(np.float32)
-    room = aligned(4 * _ROWS * len(factors) * PART)
-    spare = np.empty((_ROWS, spectra.shape[3]), np.complex64)
-    _make_maps(flat, spectra.shape, ends, places, factors, room, maps, spare, power)
+    room = aligned(4 * ROWS * len(factors) * PART)
+    spare = np.empty((ROWS, spectra.shape[3]), np.complex64)
+    make_maps(flat, spectra.shape, ends, places, factors, room, maps, spare, power)
     return np.fft.fftshift(power, axes=-1) / (known.waveform.num_tx * spectra.shape[1])
 
 
@@ -174,89 +165,40 @@ class Banded(LatinUnion):
         return above & (np.abs(doppler_bins(w) + 0.25) < share * w.num_chirps / 2)
 
 
-@jit(borrows=True)
-def _make_maps(flat, shape, ends, places, factors, room, maps, spare, power):
+@twin_of(receive_maps.make_maps)
+def make_maps(
+    flat: np.ndarray,
+    shape: tuple[int, ...],
+    ends: np.ndarray,
+    places: np.ndarray,
+    factors: np.ndarray,
+    room: np.ndarray,
+    maps: np.ndarray,
+    spare: np.ndarray,
+    power: np.ndarray,
+) -> None:
     """Add the power of all virtual channels to power (rows, P), FFT order, and write maps (L_tx,
-    L_rx, rows, P), or parts of them to `spare` where they have no room. `flat` are the real and
-    imaginary parts of samples of `shape`, `places` say where chirps stand in them; unsigned, so
-    that no index is checked for its sign.
+    L_rx, rows, P) unless there are none.
 
-    An operator is a real matrix before the DFT, so that its rows of opposite bins are conjugates.
-    With a + j b such a row and x + j y the samples, both bins follow from a x, b x, a y and b y:
-    half of the multiplications. A block of bins stays in the first-level cache for some rows, and
-    what is made of these in `room`.
+    `flat` are the real and imaginary parts of samples of `shape`, `places` say where chirps stand
+    in them; `factors` see `_operators`. `room` and `spare` are work space.
     """
     num_rx, num_rows, num_chirps = shape[1:]
-    size, operators = factors.shape[0] * PART, factors.reshape(-1)
-    for rx in range(num_rx):
-        for first in range(0, num_rows, _ROWS):
-            last = min(first + _ROWS, num_rows)
-            for tx in range(ends.size - 1):
-                sent = places[ends[tx] : ends[tx + 1]]
-                for block in range(factors.shape[0]):
-                    at = (block * factors.shape[1] + ends[tx]) * 2 * PART
-                    for i in range(first, last, 3):
-                        rows = i, min(i + 1, last - 1), min(i + 2, last - 1)
-                        samples = flat, rx * num_rows, 2 * num_chirps
-                        _three_rows(samples, rows, sent, operators, at, room, first, (size, block))
-                lines = maps[tx, rx, first:last] if maps.shape[0] else spare[: last - first]
-                for i in range(last - first):
-                    made = room[4 * i * size : 4 * (i + 1) * size]
-                    _join_bins(made.view(np.complex64), lines[i])
-                add_power(power[first:last], lines)
-
-
-@jit(borrows=True)
-def _three_rows(samples, rows, places, operators, at, room, first, part):
-    """A block of bins and the opposite ones, of three rows at once: their twelve sums, both factors
-    and a sample's two parts fill the registers of a processor that has sixteen."""
-    flat, before, step = samples
-    r0, r1, r2 = (
-        np.uint64((before + rows[0]) * step),
-        np.uint64((before + rows[1]) * step),
-        np.uint64((before + rows[2]) * step),
-    )
-    zero, imag = splat_part(np.float32(0)), np.uint64(1)
-    ax0, bx0, ay0, by0 = zero, zero, zero, zero
-    ax1, bx1, ay1, by1 = zero, zero, zero, zero
-    ax2, bx2, ay2, by2 = zero, zero, zero, zero
-    for s in range(places.size):
-        p, a, b = places[s], load_part(operators, at), load_part(operators, at + PART)
-        x, y = flat[r0 + p], flat[r0 + p + imag]
-        ax0, bx0, ay0, by0 = ax0 + a * x, bx0 + b * x, ay0 + a * y, by0 + b * y
-        x, y = flat[r1 + p], flat[r1 + p + imag]
-        ax1, bx1, ay1, by1 = ax1 + a * x, bx1 + b * x, ay1 + a * y, by1 + b * y
-        x, y = flat[r2 + p], flat[r2 + p + imag]
-        ax2, bx2, ay2, by2 = ax2 + a * x, bx2 + b * x, ay2 + a * y, by2 + b * y
-        at += 2 * PART
-    _keep_both(room, rows[0] - first, part, ax0, bx0, ay0, by0)
-    _keep_both(room, rows[1] - first, part, ax1, bx1, ay1, by1)
-    _keep_both(room, rows[2] - first, part, ax2, bx2, ay2, by2)
-
-
-@jit(inline=True)
-def _keep_both(room, row, part, ax, bx, ay, by):
-    """Write a block of bins to a row's part of `room`, and the opposite bins, the lowest first, at
-    its end."""
-    size, block = part
-    begin = 4 * row * size + 2 * block * PART
-    end = 4 * (row + 1) * size - 2 * (block + 1) * PART
-    re, im = ax - by, bx + ay
-    store(room, begin, zip_low(re, im))
-    store(room, begin + PART, zip_high(re, im))
-    re, im = backwards(ax + by), backwards(ay - bx)
-    store(room, end, zip_low(re, im))
-    store(room, end + PART, zip_high(re, im))
-
-
-@jit(borrows=True)
-def _join_bins(made, line):
-    """Bins in FFT order from what `_keep_both` wrote, the last of which is bin 0 again."""
-    half, before = line.size // 2 + 1, made.size - 1 - line.size
-    for k in range(half):
-        line[k] = made[k]
-    for k in range(half, line.size):
-        line[k] = made[before + k]
+    samples = flat.view(np.complex64)
+    half = num_chirps // 2 + 1
+    parts = factors.transpose(2, 0, 3, 1).reshape(2, -1, ends[-1])
+    real, imag = parts[:, :half]
+    lines = np.arange(num_rx * num_rows)[:, None] * num_chirps
+    for tx in range(ends.size - 1):
+        own = slice(ends[tx], ends[tx + 1])
+        x = samples[lines + places[own].astype(np.int64) // 2]
+        # the rows of the operator for opposite bins are conjugates
+        made = x @ (real[:, own] + 1j * imag[:, own]).T, x @ (real[:, own] - 1j * imag[:, own]).T
+        opposite = made[1][:, (num_chirps - 1) // 2 : 0 : -1]
+        one = np.concatenate([made[0], opposite], axis=1).reshape(num_rx, num_rows, num_chirps)
+        power += (one.real**2 + one.imag**2).sum(axis=0)
+        if len(maps):
+            maps[tx] = one
 
 
 def correlation_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
@@ -286,41 +228,18 @@ def _united(waveform: Waveform, stored: bytes) -> np.ndarray:
     times = np.frombuffer(stored)
     p = np.arange(waveform.num_chirps)
     grid = p + (times - np.floor(times)).mean()
-    resample = np.linalg.solve(_sincs(times, times), _sincs(times, grid)).T
+    band = times[:, None]
+    resample = np.linalg.solve(np.sinc(band - times), np.sinc(band - grid)).T
     out = np.fft.fft(slow_window(waveform)[:, None] * resample, axis=0).astype(np.complex64)
     out.setflags(write=False)
     return out
-
-
-@jit
-def _sincs(a, b):
-    """(A, B) `numpy.sinc` of the differences of places, by sines and cosines of each place."""
-    out = np.empty((a.size, b.size))
-    sine, cosine = np.sin(np.pi * b), np.cos(np.pi * b)
-    for i in range(a.size):
-        s, c = np.sin(np.pi * a[i]), np.cos(np.pi * a[i])
-        for j in range(b.size):
-            x = np.pi * (a[i] - b[j])
-            near = 1 - x * x / 6 * (1 - x * x / 20)
-            out[i, j] = near if abs(x) < 1e-3 else (s * cosine[j] - c * sine[j]) / x
-    return out
-
-
-# no fused products: which of two is fused the compiler may decide anew, and bits would differ
-# between processes
-@jit(borrows=True)
-def add_power(power, values):
-    """power += |values|^2 of two matrices, float32 and complex64."""
-    for i in range(power.shape[0]):
-        for j in range(power.shape[1]):
-            power[i, j] += values[i, j].real ** 2 + values[i, j].imag ** 2
 
 
 def accumulate(maps: np.ndarray) -> np.ndarray:
     """Mean power over the virtual channels, Doppler centred: (rows, P) float32."""
     power = np.zeros(maps.shape[-2:], np.float32)
     for channel in maps.reshape(-1, *maps.shape[-2:]):
-        add_power(power, channel)
+        power += channel.real**2 + channel.imag**2
     return np.fft.fftshift(power, axes=-1) / (maps.shape[0] * maps.shape[1])
 
 

@@ -16,23 +16,12 @@ count tau_D to the chirp's time.
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 
 from isac_rt.frame.cube import IFCube, SharedCube
-from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import (
-    LANES,
-    cos_sin_double,
-    floor,
-    load,
-    narrow,
-    new_memory,
-    store,
-    zip_high,
-    zip_low,
-)
+from isac_rt.kernels import receive_maps
+from isac_rt.kernels.jit import twin_of
+from isac_rt.kernels.vector import LANES, new_memory
 from isac_rt.receive.known import Known
 from isac_rt.receive.transform import transform
 
@@ -42,71 +31,31 @@ def _factors(
 ) -> np.ndarray:
     """Hann's window at sample n less each start, times exp(-j 2 pi D n/N), which moves cell k + D
     to k: (P, N) complex64."""
-    out = _padded_tones(-np.asarray(delay_symbols) / num_samples, num_samples)
-    window = _window_phases(out.shape[1], length)
-    _weigh(starts.astype(np.float64), length, *window, out.view(np.float32))
-    return np.ascontiguousarray(out[:, :num_samples])
-
-
-@lru_cache(maxsize=8)
-def _window_phases(num_samples: int, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cosine and sine of the window that begins at sample 0, at every sample."""
-    angle = 2 * np.pi / length * np.arange(num_samples)
-    return np.cos(angle), np.sin(angle)
-
-
-@jit
-def _weigh(starts, length, cosine, sine, out):
-    """Multiply rows by Hann's window from each start on, 0 outside."""
-    flat, at = out.reshape(-1), 0
-    for p in range(out.shape[0]):
-        angle = 2 * np.pi * starts[p] / length
-        c, s = 0.5 * np.cos(angle), 0.5 * np.sin(angle)
-        for n in range(0, cosine.size, LANES):
-            window = narrow(0.5 - (c * load(cosine, n) + s * load(sine, n)))
-            store(flat, at, zip_low(window, window) * load(flat, at))
-            store(flat, at + LANES, zip_high(window, window) * load(flat, at + LANES))
-            at += 2 * LANES
-        out[p, : 2 * max(int(np.ceil(starts[p])), 0)] = 0
-        out[p, 2 * int(np.floor(starts[p] + length)) + 2 :] = 0
+    angle, start = 2 * np.pi / length * np.arange(num_samples), 2 * np.pi / length * starts
+    # (1 - cos(angle - start)) / 2 as a product of matrices
+    at = np.stack([np.ones(len(start)), -np.cos(start), -np.sin(start)], axis=1) / 2
+    along = np.stack([np.ones(num_samples), np.cos(angle), np.sin(angle)])
+    window = (at @ along).astype(np.float32)
+    for line, first in zip(window, starts.tolist(), strict=True):
+        line[: max(int(np.ceil(first)), 0)] = 0.0
+        line[int(np.floor(first + length)) + 1 :] = 0.0
+    out = tones(-np.asarray(delay_symbols) / num_samples, num_samples)
+    out *= window
+    return out
 
 
 def tones(frequency: np.ndarray, num_samples: int) -> np.ndarray:
     """exp(j 2 pi f n) for n = 0 .. N-1 and each of (P,) frequencies: (P, N) complex64, to 2e-7."""
-    return np.ascontiguousarray(_padded_tones(frequency, num_samples)[:, :num_samples])
+    out = np.empty((len(frequency), num_samples + -num_samples % LANES), np.complex64)
+    fill_tones(np.asarray(frequency, float), out)
+    return np.ascontiguousarray(out[:, :num_samples])
 
 
-def _padded_tones(frequency: np.ndarray, num_samples: int) -> np.ndarray:
-    """`tones` of the next multiple of sixteen samples."""
-    blocks = -(-num_samples // LANES)
-    places = np.arange(blocks + -blocks % LANES, dtype=float)
-    out = np.empty((len(frequency), blocks * LANES), np.complex64)
-    starts = np.empty(2 * places.size, np.float32)
-    flat = out.view(np.float32).reshape(-1)
-    _fill_tones(np.asarray(frequency, float), blocks, places, starts, flat)
-    return out
-
-
-@jit
-def _fill_tones(frequency, blocks, places, starts, out):
-    """Of each sixteen samples the first one's phase, reduced in float64, times those of sixteen
-    from 0."""
-    at = 0
-    for p in range(frequency.size):
-        for b in range(0, places.size, LANES):
-            cycles = LANES * frequency[p] * load(places, b)
-            c, s = cos_sin_double(cycles - floor(cycles + 0.5))
-            store(starts, b, narrow(c))
-            store(starts, places.size + b, narrow(s))
-        cycles = frequency[p] * load(places, 0)
-        c, s = cos_sin_double(cycles - floor(cycles + 0.5))
-        lr, li = narrow(c), narrow(s)
-        for b in range(blocks):
-            c, s = starts[b], starts[places.size + b]
-            re, im = c * lr - s * li, c * li + s * lr
-            store(out, at, zip_low(re, im))
-            store(out, at + LANES, zip_high(re, im))
-            at += 2 * LANES
+@twin_of(receive_maps.fill_tones)
+def fill_tones(frequency: np.ndarray, out: np.ndarray) -> None:
+    """Fill exp(j 2 pi f n) of each frequency [cycles per sample] for all n, complex64 (P, N), N a
+    multiple of 16."""
+    out[:] = np.exp(2j * np.pi * (np.outer(frequency, np.arange(out.shape[1])) % 1.0))
 
 
 def clean_spectrum(cube: IFCube, known: Known, num_rows: int | None = None) -> np.ndarray:

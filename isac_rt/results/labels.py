@@ -8,8 +8,8 @@ import numpy as np
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.jit import jit
+from isac_rt.kernels.receive_maps import lobe_bound
 from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.receive.cfar import lobe_bound
 from isac_rt.receive.maps import UNION_FLOOR
 from isac_rt.receive.types import Detections
 

@@ -13,8 +13,9 @@ from isac_rt.frame.cube import Transmission
 from isac_rt.frame.schedule import is_latin
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.jit import jit
+from isac_rt.kernels.receive_maps import lobe_bound
 from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.receive.cfar import STRONG, CfarRule, lobe_bound
+from isac_rt.receive.cfar import STRONG, CfarRule
 from isac_rt.receive.maps import UNION_FLOOR
 from isac_rt.receive.settings import Receivers
 from isac_rt.results.labels import Places, cells_apart, hann_response

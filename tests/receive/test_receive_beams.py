@@ -15,7 +15,7 @@ from isac_rt.frame.payload import gray_bits
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.symbols.beams import _likelihood, _log_bessel, _table, demodulate_beams
+from isac_rt.receive.symbols.beams import _likelihood, demodulate_beams
 from isac_rt.receive.symbols.powers import demodulate
 from isac_rt.receive.types import Prediction
 
@@ -248,12 +248,3 @@ def test_reception_with_beams():
     blind = replace(NEAR, direction=np.full((1, 2), np.nan))
     r = receive_passive(noisy(clean, -10.0, 4), ANTENNAS, settings, ORDER, blind, True)
     assert r.decoded and r.soft_bits.size == 0 and r.confidence_looks == 15
-
-
-def test_the_logarithm_of_bessels_function_is_scipys():
-    """Between the table's places and beyond them, in float64. Planted bugs: the slope not per step;
-    the series without its second term (1e-6); a straight line between places (1e-4)."""
-    x = np.concatenate([np.linspace(0, 300, 5001), np.geomspace(200, 1e6, 100)])
-    found = np.empty_like(x)
-    _log_bessel(x, *_table(), found)
-    assert np.abs(found - (np.log(special.i0e(x)) + x)).max() < 1e-8

@@ -27,7 +27,6 @@ from isac_rt.receive.cfar import (
 from isac_rt.receive.chain import cfar_of
 from isac_rt.receive.estimate import (
     STENCILS,
-    Estimator,
     LocalSpectra,
     _newton,
     direction_cosine,
@@ -42,7 +41,6 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import (
     Conventional,
     LatinUnion,
-    _sincs,
     accumulate,
     channel_maps,
     correlation_operator,
@@ -70,15 +68,6 @@ def white(w: Waveform, schedule: np.ndarray, num_rx: int, seed: int) -> IFCube:
 
 
 # --- Doppler
-
-
-def test_sincs_of_differences_are_numpys():
-    """Also of places that are equal, or all but equal. Planted bug: sine and cosine the other way
-    round."""
-    places = np.arange(120) + 0.2 * np.random.default_rng(3).random(120)
-    for others in (places, np.arange(120) + 0.11, places + 1e-7, places + 3e-4):
-        expected = np.sinc(places[:, None] - others)
-        assert np.abs(_sincs(places, others) - expected).max() < 1e-11  # 1e-14 over 1e-3
 
 
 @pytest.mark.parametrize(
@@ -770,26 +759,6 @@ def test_refinement_is_that_of_plain_numpy(beam: bool | None):
         # rounding of logarithms over the squared step
         assert (found.delay, found.delay_rate) == pytest.approx(expected, rel=1e-9, abs=1e-18)
         assert np.array_equal(found.channels, local.respond(found.delay, found.delay_rate))
-
-
-@pytest.mark.parametrize("separate", [False, True])
-@pytest.mark.parametrize("on_grid", [False, True])
-def test_peaks_of_a_frame_are_estimated_as_each_alone(on_grid: bool, separate: bool):
-    """To the last bit, also at the ends of the axis, where rows are fewer. Planted bug: places from
-    the axis's first row for the peak's."""
-    w, schedule, payload = frame(waveform=Waveform(num_samples=256, num_chirps=36))
-    spectra = clean_spectrum(white(w, schedule, 17, 3), known(w, schedule, payload))
-    wide = replace(ANTENNAS, rx_x=9, rx_z=9)
-    sent = known(w, schedule, payload, wide)
-    power = np.random.default_rng(1).random((128, 36), np.float32)
-    rows, bins = np.array([64, 0, 127, 31]), np.array([0, 35, 17, 3])
-    estimator = Estimator(on_grid)
-    every = estimator.at_peaks(spectra, sent, power, rows, bins, separate=separate)
-    for one, row, column in zip(every, rows.tolist(), bins.tolist(), strict=True):
-        local = LocalSpectra(spectra, sent, row, separate=separate)
-        alone = estimator.at(local, power, row, column)
-        assert (one.delay, one.delay_rate) == (alone.delay, alone.delay_rate)
-        assert np.array_equal(one.channels, alone.channels)
 
 
 @pytest.mark.parametrize("bend", [[[3.1, 1.7], [1.7, 2.3]], [[2.3, -1.1], [-1.1, 4.7]]])

@@ -17,11 +17,12 @@ from scipy import ndimage
 from isac_rt.kernels.hermitian import inverses
 from isac_rt.receive.arms import all_channels, both_arms
 from isac_rt.receive.cfar import (
+    LOBE_MARGIN,
     CfarRule,
     first_row,
+    leaked,
     strong_lobes,
     strongest_peaks,
-    without_sidelobes,
 )
 from isac_rt.receive.clutter.adaptive import scanned, threshold_of
 from isac_rt.receive.clutter.coherent import (
@@ -309,9 +310,8 @@ def in_skirt(rows: np.ndarray, bins: np.ndarray, power: np.ndarray, first: int) 
     """Which cells hold no more than the lobes of the strongest path before the row `first`: the
     transmitter's leakage."""
     row, column = np.unravel_index(power[:first].argmax(), power[:first].shape)
-    pairs = [(np.array([row, r]), np.array([column, b])) for r, b in zip(rows, bins, strict=True)]
-    kept = [without_sidelobes(*pair, power, power.shape[1], UNION_FLOOR)[1] for pair in pairs]
-    return ~np.array(kept, bool)
+    lobes = leaked(rows - row, bins - column, power.shape[1], UNION_FLOOR)
+    return np.asarray(power[rows, bins] <= LOBE_MARGIN * power[row, column] * lobes)
 
 
 def noise_level(power: np.ndarray, expected: np.ndarray | None, looks: int) -> float:

@@ -27,7 +27,14 @@ from scipy import ndimage, optimize, special
 from isac_rt.frame.antennas import Antennas
 from isac_rt.kernels.hermitian import inverses
 from isac_rt.receive.arms import Channels
-from isac_rt.receive.cfar import CfarRule, first_row, hann_envelope, strong_lobes, strongest_peaks
+from isac_rt.receive.cfar import (
+    LOBE_MARGIN,
+    CfarRule,
+    first_row,
+    hann_envelope,
+    strong_lobes,
+    strongest_peaks,
+)
 from isac_rt.receive.clutter.adaptive import scanned
 from isac_rt.receive.clutter.angle_doppler import FINE, noise_level
 from isac_rt.receive.clutter.coherent import (
@@ -57,7 +64,6 @@ it."""
 SAME_DIRECTION = 0.2
 """Off a strong path by less than this in both direction cosines, about a resolution of the default
 array, what its lobes could hide is taken for what its removal left."""
-LOBE_MARGIN = 4.0
 BOUNDED, SCALLOPED = 2, 1.12
 """Every so many directions of the grid is looked at for the bound, which an arm's power between two
 of them may exceed by this factor in amplitude."""

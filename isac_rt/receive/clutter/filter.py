@@ -21,7 +21,6 @@ import numpy as np
 from scipy import special
 
 from isac_rt.frame.schedule import Schedule
-from isac_rt.kernels.jit import jit
 from isac_rt.receive.transform import transform
 
 GAP = 3
@@ -72,22 +71,24 @@ def runs(power: np.ndarray, looks: float, least: int) -> np.ndarray:
     """
     lines = power.reshape(-1, power.shape[-1])
     floor = np.median(lines, axis=1, keepdims=True)
-    inside = np.zeros(lines.shape, bool)
-    _mark(lines > occupied_factor(looks) * floor, least, inside)
+    inside = _in_runs(lines > occupied_factor(looks) * floor, least)
     return inside.reshape(power.shape)
 
 
-@jit
-def _mark(occupied, least, inside):
-    """Mark runs of occupied cells of at least `least`, gaps closed, with a margin."""
-    count = occupied.shape[1]
-    for i in range(len(occupied)):
-        begin, last = 0, -count
-        for k in range(count + GAP + 1):
-            if k < count and occupied[i, k]:
-                begin, last = (begin if k - last <= GAP + 1 else k), k
-            elif k - last == GAP + 1 and last - begin + 1 >= least:
-                inside[i, max(begin - MARGIN, 0) : last + MARGIN + 1] = True
+def _in_runs(occupied: np.ndarray, least: int) -> np.ndarray:
+    """Which cells of lines lie in runs of at least `least` occupied ones, gaps closed, with a
+    margin."""
+    apart = max(GAP, 2 * MARGIN) + 1  # empty cells between the lines keep their runs apart
+    wide = np.pad(occupied, ((0, 0), (MARGIN, apart)))
+    at = np.flatnonzero(wide)
+    breaks = np.flatnonzero(np.diff(at) > GAP + 1)
+    first, last = at[np.append(0, breaks + 1)[: at.size]], at[np.append(breaks, -1)[: at.size]]
+    long = last - first + 1 >= least
+    steps = np.zeros(wide.size + 1, np.int64)
+    np.add.at(steps, first[long] - MARGIN, 1)
+    np.add.at(steps, last[long] + MARGIN + 1, -1)
+    inside = np.cumsum(steps[:-1]).reshape(wide.shape) > 0
+    return inside[:, MARGIN : MARGIN + occupied.shape[1]]
 
 
 def remove_standing(spectra: np.ndarray, schedule: Schedule, least: int | None) -> np.ndarray:

@@ -20,8 +20,6 @@ import numpy as np
 import scipy.fft
 
 from isac_rt.frame.waveform import Waveform
-from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import LANES, load, splat, store
 from isac_rt.receive.estimate import hann_response
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import slow_window
@@ -107,59 +105,34 @@ class Response:
         """(1 + A, rows, P) power, and its derivatives where the bins of all scatterers move by
         `slope` (K, A), Doppler centred."""
         across, along = _kernels(self.waveform, self.taper)
-        turn = 2j * np.pi * np.arange(along.size) / self.waveform.num_chirps
-        size, places = self.waveform.num_chirps, self.waveform.num_chirps * FINE_DOPPLER
+        size = self.waveform.num_chirps
+        turn, bins = 2j * np.pi * np.arange(along.size) / size, np.arange(size // 2 + 1)
         out = np.empty((1 + slope.shape[1], self.rows, size))
-        width = places + -places % LANES
-        grid = np.empty(((self.rows + 2 * REACH) * FINE_BEAT, width))
-        heard = np.empty((self.rows, width))
-        folded = np.empty((self.rows, size // 2 + 1), complex)
         for number, made in enumerate(out):
             weight = power if number == 0 else power * slope[:, number - 1]
-            _put(beat, doppler, np.asarray(weight, float), places, grid)
-            _weigh_lines(grid, across / FINE_DOPPLER, heard)
-            spectra = scipy.fft.rfft(heard[:, :places])
-            _fold(spectra, along if number == 0 else -along * turn, size, folded)
+            grid = self._on_grid(beat, doppler, weight)
+            heard = np.zeros((self.rows, grid.shape[1]))
+            for k, share in enumerate(across / FINE_DOPPLER):
+                heard += share * grid[k:][: FINE_BEAT * self.rows : FINE_BEAT]
+            # every third place alone is wanted: the three parts of the spectrum fall together
+            spectra = scipy.fft.rfft(heard) * (along if number == 0 else -along * turn)
+            folded = spectra[:, bins] + spectra[:, size + bins] + spectra[:, size - bins].conj()
             made[:] = scipy.fft.irfft(folded, size)
         return np.fft.fftshift(out, axes=2)
 
-
-@jit(borrows=True)
-def _put(beat, doppler, weight, places, grid):
-    """Scatterers on the nearest line of the fine grid, shared by the two of its places about their
-    Doppler."""
-    grid[:] = 0.0
-    for k in range(weight.size):
-        line = int(np.rint((beat[k] + REACH) * FINE_BEAT))
-        if 0 <= line < grid.shape[0]:
-            at = doppler[k] * FINE_DOPPLER
-            left = np.floor(at)
-            place, share = int(left) % places, at - left
-            grid[line, place] += weight[k] * (1 - share)
-            grid[line, (place + 1) % places] += weight[k] * share
-
-
-@jit(borrows=True)
-def _fold(spectra, response, size, out):
-    """The product of both, of which every third place alone is wanted: the three parts of the
-    spectrum fall together."""
-    for i in range(out.shape[0]):
-        for k in range(out.shape[1]):
-            up, down = size + k, size - k
-            value = spectra[i, k] * response[k] + spectra[i, up] * response[up]
-            out[i, k] = value + (spectra[i, down] * response[down]).conjugate()
-
-
-@jit(borrows=True)
-def _weigh_lines(lines, weights, out):
-    """Each row of `out` is the weighted sum of the lines about it."""
-    flat, width, to = lines.reshape(-1), lines.shape[1], out.reshape(-1)
-    for first in range(0, width, LANES):
-        for r in range(out.shape[0]):
-            total, at = splat(0.0), FINE_BEAT * r * width + first
-            for k in range(weights.size):
-                total = total + weights[k] * load(flat, at + k * width)
-            store(to, r * width + first, total)
+    def _on_grid(self, beat: np.ndarray, doppler: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Scatterers on the nearest line of the fine grid, shared by the two of its places about
+        their Doppler."""
+        places = self.waveform.num_chirps * FINE_DOPPLER
+        lines = (self.rows + 2 * REACH) * FINE_BEAT
+        line = np.rint((beat + REACH) * FINE_BEAT).astype(np.int64)
+        inside = (line >= 0) & (line < lines)
+        at = doppler[inside] * FINE_DOPPLER
+        left = np.floor(at).astype(np.int64)
+        share, first, weight = at - left, line[inside] * places, weight[inside]
+        grid = np.bincount(first + left % places, weight * (1 - share), lines * places)
+        grid += np.bincount(first + (left + 1) % places, weight * share, lines * places)
+        return grid.reshape(lines, places)
 
 
 def expected_power(

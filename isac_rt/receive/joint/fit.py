@@ -25,7 +25,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isac_rt.kernels.jit import jit
 from isac_rt.receive.joint.interaction import CLOSE, TANGENTS, Places, clusters, ignored, shared
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.joint.tones import (
@@ -233,8 +232,8 @@ class _Descent:
         self._take_out(left, near, sums, amplitude)
         left[active] -= amplitude[active, None, None, :, None] * self.own[:2, :2]
         itself = np.broadcast_to(self.own, (active.size, *sums.shape[1:])).astype(complex)
-        _blocks(np.column_stack([active, active]), slopes, itself, gram)
-        _blocks(near, slopes, sums, gram)
+        _put_blocks(gram, np.column_stack([active, active]), slopes, itself)
+        _put_blocks(gram, near, slopes, sums)
         parts = left.reshape(self.free, 4, *left.shape[3:])
         gradient = np.einsum("ksbrt,kbrt->ks", slopes.conj(), parts, optimize=True).real.ravel()
         twice = self._by_amplitude(seen + left[:, 0, 0])
@@ -324,36 +323,18 @@ class _Descent:
         return Fit(paths, self.noise * self.moments.size)
 
 
-@jit(fast=True)
-def _blocks(pairs, slopes, sums, gram):
+def _put_blocks(gram: np.ndarray, pairs: np.ndarray, slopes: np.ndarray, sums: np.ndarray) -> None:
     """Put the products of two paths' derivatives over all samples into the Gram matrix, for each
-    pair and turned round."""
-    size, num_tx, num_rx = slopes.shape[1], slopes.shape[3], slopes.shape[4]
-    half, block = np.empty(4, np.complex128), np.empty((size, size))
-    for s in range(len(pairs)):
-        k, j = pairs[s]
-        block[:] = 0.0
-        for tx in range(num_tx):
-            for rx in range(num_rx):
-                own, other = slopes[k, :, :, tx, rx], slopes[j, :, :, tx, rx]
-                both = sums[s, :, :, tx, rx]
-                for i in range(size):
-                    if i >= PARAMETERS and own[i, 0] == 0:
-                        continue  # another antenna's amplitude
-                    half[:] = 0
-                    for a in range(4):
-                        for b in range(4):
-                            powers = both[a // 2 + b // 2, a % 2 + b % 2]
-                            half[b] += own[i, a].conjugate() * powers
-                    for n in range(size):
-                        total = 0.0
-                        for b in range(4):
-                            total += (half[b] * other[n, b]).real
-                        block[i, n] += total
-        for i in range(size):
-            for n in range(size):
-                gram[k * size + i, j * size + n] = block[i, n]
-                gram[j * size + n, k * size + i] = block[i, n]
+    pair and turned round; `slopes` as `_Descent._slopes`, `sums` as `cross_sums`."""
+    size, part = slopes.shape[1], np.arange(4)
+    n, t = part // 2, part % 2  # powers of the sample and of time that a part of a slope has
+    both = sums[:, n[:, None] + n, t[:, None] + t]
+    for (k, j), products in zip(pairs.tolist(), both, strict=True):
+        block = np.einsum(
+            "iaxr,abxr,nbxr->in", slopes[k].conj(), products, slopes[j], optimize=True
+        ).real
+        rows, columns = slice(k * size, (k + 1) * size), slice(j * size, (j + 1) * size)
+        gram[rows, columns], gram[columns, rows] = block, block.T
 
 
 def energy(known: Known, paths: Sequence[JointPath]) -> float:

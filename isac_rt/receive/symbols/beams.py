@@ -10,8 +10,6 @@ of them at once and taken out.
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 from scipy import special
 
@@ -20,7 +18,6 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import by_antenna, demodulate_bits, gray_bits, running_phases
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.kernels.jit import jit
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.clutter.filter import chirp_runs
 from isac_rt.receive.spectrum import tones
@@ -42,8 +39,6 @@ LOADING = 1e-2
 """Of the weights that keep another path out: noise they may take up, relative to a path of weight 1
 on one receiver."""
 VELOCITY_STEPS = 81
-FINE, FARTHEST = 32, 256
-"""Places per unit of the table of Bessel's function, and where it ends."""
 FARTHEST_BINS, FARTHEST_STDS = 1.0, 4.0
 """Where the true velocity is sought about the predicted one."""
 
@@ -184,32 +179,7 @@ def _likelihood(spectra: np.ndarray) -> tuple[float, float, np.ndarray]:
     noise = max(float(np.median(power)) / np.log(2), 1e-300)
     snr = max(float(np.median(power.max(axis=-1))) / noise - 1, 1e-3)
     x = 2 * np.sqrt(snr * power / noise)
-    likelihood = np.empty_like(x)
-    _log_bessel(x.reshape(-1), *_table(), likelihood.reshape(-1))
-    return noise, snr, likelihood
-
-
-@lru_cache(maxsize=1)
-def _table() -> tuple[np.ndarray, np.ndarray]:
-    """ln I_0(x) - x at x = 0, 1/FINE, ... up to FARTHEST, and its slope from one to the next."""
-    x = np.arange(FARTHEST * FINE + 2) / FINE
-    value = special.i0e(x)
-    return np.log(value), (special.i1e(x) / value - 1) / FINE
-
-
-@jit
-def _log_bessel(x, value, slope, out):
-    """ln I_0(x): cubic between the table's places, to 1e-8, then the asymptotic series."""
-    for n in range(x.size):
-        if x[n] < FARTHEST:
-            i = int(x[n] * FINE)
-            t = x[n] * FINE - i
-            step = value[i + 1] - value[i]
-            bend, turn = slope[i] - step, step - slope[i + 1]
-            between = (1 - t) * t * ((1 - t) * bend + t * turn)
-            out[n] = x[n] + value[i] + t * step + between
-        else:
-            out[n] = x[n] - 0.5 * np.log(2 * np.pi * x[n]) + (1 + 0.5 / x[n]) / (8 * x[n])
+    return noise, snr, x + np.log(special.i0e(x))
 
 
 def transitions_of(
