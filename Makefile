@@ -94,4 +94,4 @@ lock:
 
 clean:
 	rm -rf .venv .cache .pytest_cache .mypy_cache .ruff_cache .hypothesis
-	find isac_rt tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find isac_rt reproduce benchmarks tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -220,13 +220,17 @@ def load_data(file: Path, key: str) -> Any | None:
 def program_fingerprint() -> str:
     """Version of this package and a digest of its source and tables: two runs with the same one
     were made by the same program."""
+    source = source_digest(Path(__file__).resolve().parent)
+    return f"{importlib.metadata.version('isac_rt')}+{source}"
+
+
+def source_digest(folder: Path) -> str:
+    """Digest of the source and the tables in a folder."""
     digest = hashlib.sha256()
-    package = Path(__file__).resolve().parent
-    for file in sorted(
-        file for file in package.rglob("*") if file.suffix in (".py", ".json")
-    ):  # JSON: costs decide between methods
-        digest.update(f"{file.relative_to(package)}\0".encode() + file.read_bytes() + b"\0")
-    return f"{importlib.metadata.version('isac_rt')}+{digest.hexdigest()[:16]}"
+    files = (file for file in folder.rglob("*") if file.suffix in (".py", ".json"))
+    for file in sorted(files):  # JSON: costs decide between methods
+        digest.update(f"{file.relative_to(folder)}\0".encode() + file.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
 
 
 @lru_cache(maxsize=1)

@@ -648,8 +648,7 @@ def check_planted(words: str) -> int:
     """Plant the bug of every case; print those that do not make it fail by its number."""
     sys.path.insert(0, str(ROOT))  # the cases of this checkout, whichever is installed
     from planted import OF_CASES
-
-    from isac_rt.studies.validation import all_cases
+    from truths import all_cases
 
     wrong, count = 0, 0
     with tempfile.TemporaryDirectory() as folder:
@@ -668,7 +667,7 @@ def check_planted(words: str) -> int:
                 )
                 continue
             program = (
-                "from isac_rt.studies.validation import all_cases, run_case; "
+                "from truths import all_cases, run_case; "
                 f"v = run_case(next(c for c in all_cases() if c.name == {one.name!r})); "
                 "print(v.passed, v.error, v.note)"
             )

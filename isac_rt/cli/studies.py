@@ -1,17 +1,38 @@
-"""Commands that judge the program and the paper: `reproduce`, `validate`, `bench`."""
+"""Commands that judge the program and the paper: `reproduce`, `validate`, `bench`. What they run
+stands outside the package, in a checkout: `reproduce/`, `tests/truths/` and `benchmarks/`."""
 
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.text import Text
 
+import isac_rt
 from isac_rt.cli.arguments import InputProblem, Quick, check_names
 from isac_rt.cli.console import say, say_table, with_progress
 from isac_rt.cli.interruption import ending_soon_after_interrupt
+from isac_rt.runtime import UserError
+
+
+def _from_checkout(folder: str) -> None:
+    """Let Python find the packages in a folder of the checkout that this package runs from.
+
+    Raises
+    ------
+    UserError  If the package was installed from a wheel.
+    """
+    root = Path(isac_rt.__file__).resolve().parents[1]
+    if not all((root / name).exists() for name in ("pyproject.toml", "reproduce", folder)):
+        raise UserError(
+            "reproduce, validate and bench run in a checkout of isac_rt, and this is an installed "
+            f"package; unpack the source distribution of version {isac_rt.__version__} and run "
+            "make setup there"
+        )
+    sys.path[:0] = [str(root / folder), str(root)] if folder == "tests" else [str(root)]
 
 
 def reproduce(
@@ -30,8 +51,9 @@ def reproduce(
     ] = None,
 ) -> None:
     """Run the paper's tables, figures and claims again and judge them."""
-    from isac_rt.studies.paper import TITLES
-    from isac_rt.studies.paper import names as experiments
+    _from_checkout("reproduce")
+    from reproduce import TITLES
+    from reproduce import names as experiments
 
     if not names:
         rows = [(name, TITLES[name]) for name in experiments()]
@@ -50,10 +72,10 @@ def _reproduce(name: str, folder: Path, quick: bool, seed: int, seeds: int | Non
     from isac_rt.results.files import check_folder
 
     check_folder(folder)
-    from isac_rt.studies.paper import experiment
-    from isac_rt.studies.paper.city_flights import repeated
-    from isac_rt.studies.paper.montecarlo import kept_in
-    from isac_rt.studies.paper.outcome import write
+    from reproduce import experiment
+    from reproduce.city_flights import repeated
+    from reproduce.montecarlo import kept_in
+    from reproduce.outcome import write
 
     with kept_in(folder / "frames"), repeated(seeds):
         outcome = with_progress(lambda report: experiment(name)(quick, seed, report), name)
@@ -78,9 +100,11 @@ def validate(
     ] = "",
 ) -> None:
     """Hold every physical and numerical claim of the program against an independent truth."""
+    _from_checkout("tests")
+    from truths import all_cases
+    from truths.table import write_json, write_markdown
+
     from isac_rt.results.files import check_folder
-    from isac_rt.studies.validation import all_cases
-    from isac_rt.studies.validation.table import write_json, write_markdown
 
     cases = [
         case for case in all_cases(quick) if only.lower() in f"{case.group} {case.name}".lower()
@@ -107,8 +131,8 @@ def validate(
 
 def _validate(cases: list[Any]) -> list[Any]:
     """Run cases with a bar, print their table, return the verdicts."""
-    from isac_rt.studies.validation import run_case
-    from isac_rt.studies.validation.table import STATES, shown
+    from truths import run_case
+    from truths.table import STATES, shown
 
     verdicts: list[Any] = []
 
@@ -150,18 +174,13 @@ def bench(
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the rows to a file too.")
     ] = None,
-    fit: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Only fit accuracy.cost_model to this machine."),
-    ] = None,
 ) -> None:
     """Speed against error, method by method. Cost is in floors: one floor is the processor time to
     fill one cube of samples and transform it once, measured in the same run."""
-    if fit is not None:
-        return _fit(fit)
+    _from_checkout("benchmarks")
+    from benchmarks import command, report
     from isac_rt.results.files import check_folder
     from isac_rt.storage import write_whole
-    from isac_rt.studies.bench import command, report
 
     chosen = list(dict.fromkeys(stages or report.stages()))
     check_names(chosen, report.stages(), "stage")
@@ -190,25 +209,3 @@ def bench(
         say_table(lines[0], lines[2:])
     say(*(f"{name} left out: {reason}" for name, reason in found["left_out"].items()))
     say(f"in {out}: {', '.join(file.name for file in files)}")
-
-
-def _fit(file: Path) -> None:
-    """Measure what the methods of synthesis cost here, for accuracy.cost_model of a scenario."""
-    from isac_rt.results.files import check_folder
-    from isac_rt.storage import write_whole
-    from isac_rt.studies.bench.fit import fit
-
-    check_folder(file.parent)
-    found = with_progress(lambda moved: fit(progress=moved), "repeats")
-    write_whole(file, json.dumps(found, indent=1) + "\n")
-    rows = [
-        (
-            name,
-            f"{row['chirp_ns'] / 1000:.3g}",
-            f"{row['path_ns']:.3g}",
-            f"{100 * row['deviation']:.2g}",
-        )
-        for name, row in found["methods"].items()
-    ]
-    say_table(("method", "chirp [us]", "path [ns]", "deviation [%]"), rows)
-    say(f"{file}: name it in accuracy.cost_model of a scenario")

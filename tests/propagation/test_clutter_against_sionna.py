@@ -8,13 +8,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from truths.clutter import sionna_power
 
 from isac_rt import scenario
 from isac_rt.frame.link import Link
 from isac_rt.propagation.clutter.cells import area_for
 from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in, swarm_of
-from isac_rt.studies.validation.clutter import sionna_power
 from isac_rt.world.city import load_city
 from isac_rt.world.city.mesh import distance_to_triangles
 

@@ -6,13 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks import clutter, synthesis
+from benchmarks.measure import cpu_seconds
+from benchmarks.scenes import alone, town
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.methods import Gridded
 from isac_rt.simulation.audit import tracer_of
 from isac_rt.simulation.setup import prepare
-from isac_rt.studies.bench import clutter, synthesis
-from isac_rt.studies.bench.measure import cpu_seconds
-from isac_rt.studies.bench.scenes import alone, town
 
 
 def test_synthesis_grows_no_faster_than_its_paths():

@@ -8,6 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from truths import stage
+from truths.truths import WAVELENGTH, chain_length
 
 from isac_rt import scenario as tree
 from isac_rt.document import ScenarioError, ScenarioWarning
@@ -21,8 +23,6 @@ from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.methods import Auto
 from isac_rt.simulation.preflight import check_flights, warn_of_aliases
 from isac_rt.simulation.setup import prepare, swarm_of, timetable_of
-from isac_rt.studies.validation import stage
-from isac_rt.studies.validation.truths import WAVELENGTH, chain_length
 from isac_rt.world.city import CityMesh, load_city
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface, clean

@@ -34,11 +34,11 @@ from isac_rt.simulation import simulate
 from isac_rt.simulation.resume import FILE, Resume, ResumeError
 from isac_rt.simulation.setup import prepare
 from isac_rt.storage import checksum, load_data, pack, save_data
-from isac_rt.studies.paper import montecarlo
 from isac_rt.sweep import Outcomes, load_sweep, open_sweep, save_dataset, status
 from isac_rt.sweep.execute import Job, run_job
 from isac_rt.sweep.outcomes import _checksum, assemble
 from isac_rt.views.interchange import write_sigmf
+from reproduce import montecarlo
 
 SCENE = """
 name: small

@@ -10,7 +10,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from benchmarks.fit import fit
 
+from benchmarks.measure import cpu_seconds
+from benchmarks.synthesis import Job, relative
 from isac_rt.cli.cli import main
 from isac_rt.document import ScenarioError
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
@@ -31,9 +34,6 @@ from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, _strongest
 from isac_rt.signal.tones import tones_of
 from isac_rt.simulation.plan import decisions
 from isac_rt.simulation.setup import prepare
-from isac_rt.studies.bench.fit import fit
-from isac_rt.studies.bench.measure import cpu_seconds
-from isac_rt.studies.bench.synthesis import Job, relative
 
 SCENES = Path(__file__).parents[2] / "scenes"
 SHAPE = (3, 15, 120, 1024)
@@ -183,7 +183,7 @@ def test_a_fit_is_a_model(tmp_path, capsys, monkeypatch):
     """Thirty chirps, three times: the file is read, and 1000 paths are dearer one by one (35
     times). A run names it, by a path from where its scenario is saved. Planted bug: `record` of the
     shipped model whatever the scenario names."""
-    monkeypatch.setattr("isac_rt.studies.bench.fit.fit", lambda progress: fit(30, 3, progress))
+    monkeypatch.setattr("benchmarks.fit.fit", lambda progress: fit(30, 3, progress))
     file = tmp_path / "here" / "mine.json"
     assert main(["bench", "--fit", str(file)]) == 0
     assert "mine.json" in capsys.readouterr().out

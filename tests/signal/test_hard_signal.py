@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from truths import stage
+from truths.stage import FEW, SMALL
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.payload import unmodulated
@@ -18,8 +20,6 @@ from isac_rt.receive.types import Prediction
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.gridded import GRIDDED_ERROR
 from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, Method
-from isac_rt.studies.validation import stage
-from isac_rt.studies.validation.stage import FEW, SMALL
 
 C = SPEED_OF_LIGHT
 COMPLEX64 = 1e-6  # rounding of complex64 samples, in both of what is compared

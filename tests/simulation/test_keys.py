@@ -21,9 +21,9 @@ from isac_rt.results import provenance
 from isac_rt.results.provenance import UNSEEN_BY_PATHS, path_content, run_content
 from isac_rt.scenario.file import load
 from isac_rt.storage import PACKAGES
-from isac_rt.studies.paper import montecarlo
 from isac_rt.sweep.definition import ground_of, load_sweep, paths_key, point_key
 from isac_rt.world.swarm import Pose
+from reproduce import montecarlo
 
 SCENE = """
 name: keyed
@@ -90,8 +90,12 @@ def test_keys_hold_the_version_of_python_and_the_program(folder, monkeypatch):
     with monkeypatch.context() as once:
         once.setattr(platform, "python_version", lambda: "3.99.1")
         assert not set(keys(folder).values()) & set(before.values())
-    for module in ("results.provenance", "sweep.definition", "studies.paper.montecarlo"):
-        monkeypatch.setattr(f"isac_rt.{module}.program_fingerprint", lambda: "another")
+    for module in (
+        "isac_rt.results.provenance",
+        "isac_rt.sweep.definition",
+        "reproduce.montecarlo",
+    ):
+        monkeypatch.setattr(f"{module}.program_fingerprint", lambda: "another")
     assert not set(keys(folder).values()) & set(before.values())
 
 

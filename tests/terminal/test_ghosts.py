@@ -12,7 +12,6 @@ import trimesh
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
-from isac_rt.studies.paper.ghosts import explained_tracks, run, verdicts, whole_tracks
 from isac_rt.terminal.filter import Ambiguity, Gaussian
 from isac_rt.terminal.ghosts import Leeway, Walls, echoes, reflections, suspicion
 from isac_rt.terminal.images import Doubts
@@ -20,6 +19,7 @@ from isac_rt.terminal.settings import Tracking
 from isac_rt.terminal.tracker import Track, Tracker, track_set
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
+from reproduce.ghosts import explained_tracks, run, verdicts, whole_tracks
 
 ORIGIN = np.array([310.7, -120.3, 41.9])
 RESOLUTION = np.array([0.25, 0.249, 0.108, 0.108])
