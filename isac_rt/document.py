@@ -56,8 +56,24 @@ class ScenarioError(UserError):
 # ---- YAML
 
 
-class Loader(yaml.SafeLoader):
-    """Composes nodes; only `SCALARS` are told from words."""
+class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """Composes at most `MAX_NODES` nodes; only `SCALARS` are told from words."""
+
+    nodes = depth = 0
+
+    def descend_resolver(self, parent: yaml.Node | None, index: Any) -> None:
+        """Called before each node."""
+        self.nodes += 1
+        self.depth += 1
+        if self.depth > 2 * MAX_DEPTH:
+            raise yaml.YAMLError(f"nested more than {MAX_DEPTH} levels deep")
+        if self.nodes > MAX_NODES:
+            raise yaml.YAMLError(f"more than {MAX_NODES} values; is it the right file?")
+        super().descend_resolver(parent, index)
+
+    def ascend_resolver(self) -> None:
+        self.depth -= 1
+        super().ascend_resolver()
 
 
 Loader.yaml_implicit_resolvers = {}
@@ -98,12 +114,8 @@ class _Reader:
         self._left = MAX_NODES
 
     def parse(self, text: str, key: Key = ()) -> Any:
-        """The value of a YAML text; None if it is empty. Raises yaml.YAMLError, also for what nests
-        too deeply."""
-        try:
-            node = yaml.compose(text, Loader=Loader)
-        except RecursionError:
-            raise yaml.YAMLError(f"nested more than {MAX_DEPTH} levels deep") from None
+        """The value of a YAML text; None if it is empty. Raises yaml.YAMLError."""
+        node = yaml.compose(text, Loader=Loader)
         return None if node is None else self._value(node, key, 0)
 
     def _value(self, node: yaml.Node, key: Key, depth: int) -> Any:
@@ -162,14 +174,16 @@ def _yaml_complaint(error: yaml.YAMLError, text: str) -> tuple[int | None, str]:
     if isinstance(error, yaml.MarkedYAMLError):
         mark = error.problem_mark or error.context_mark
         said = error.problem or error.context or "cannot be read"
-        if "'\\t'" in said:
+        lines = text.split("\n")
+        if mark and mark.line < len(lines) and lines[mark.line][mark.column :].startswith("\t"):
             said = "a tab stands where YAML wants spaces; indent with spaces"
         elif error.context and error.problem_mark is not None and error.context not in said:
             said = f"{said} ({error.context})"
         return (mark.line + 1 if mark else None), said
     if isinstance(error, yaml.reader.ReaderError):
-        character = f"#x{ord(text[error.position]):04x}"
-        line = text.count("\n", 0, error.position) + 1
+        at = yaml.reader.Reader.NON_PRINTABLE.search(text)
+        assert at is not None
+        character, line = f"#x{ord(at[0]):04x}", text.count("\n", 0, at.start()) + 1
         return line, f"the character {character} is not allowed in YAML; remove it"
     return None, str(error)
 

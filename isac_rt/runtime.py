@@ -26,6 +26,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import chdir, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 OLDEST_LLVM = 17
 NEWEST_LLVM = 22
@@ -408,7 +409,8 @@ def activate() -> Backend:
             f"{' or '.join(VARIANTS.values())}; "
             "call isac_rt.runtime.activate() before anything else sets a variant"
         )
-    resolver = mi.file_resolver()  # which looks for libraries in the working folder first
+    resolver_of: Any = mi.file_resolver  # which its stubs do not know
+    resolver = resolver_of()  # looks for libraries in the working folder first
     resolver.clear()
     resolver.append(str(Path(mi.__file__).parent))
     return backend

@@ -45,6 +45,11 @@ BAD_DATA = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeErro
 """What reading data can raise that this package did not write."""
 MOST_BYTES = 4 * 1024**3
 """No file of data is larger than this."""
+HDF5_PACKING = 1100
+"""Bytes that one byte of an HDF5 file can stand for: deflate makes 1032 of one."""
+MAX_HDF5_PIECE = 2**24
+"""A piece (chunk) that is larger than its dataset has at most so many bytes."""
+MAX_HDF5_DEPTH = 8
 KEPT = "ISAC_RT_KEPT"
 """Variable of the environment: folder of what is `kept`; empty: nothing is."""
 KEPT_BYTES = 1024**3
@@ -185,6 +190,46 @@ def read_whole(file: Path, most: int = MOST_BYTES) -> bytes:
         if status.st_size > most:
             raise OSError(errno.EFBIG, f"is larger than {most} bytes", str(file))
         return opened.read()
+
+
+def check_unfolded(opened: Any, file_bytes: int, most: float, refuse_links: bool = True) -> None:
+    """Refuse an HDF5 file (an open `h5py.File`) that asks for more than its numbers need: more
+    bytes than `most`, more than any packing of its bytes makes, or pieces that are larger than what
+    they are pieces of; and links and other files, unless the reader leaves them out.
+
+    Raises
+    ------
+    ValueError
+    """
+    import h5py
+
+    total = 0
+
+    def look(group: Any, depth: int) -> None:
+        nonlocal total
+        for name in group:
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                if refuse_links:
+                    raise ValueError(f"{name} is a link")
+                continue
+            node = group[name]
+            if isinstance(node, h5py.Group) and depth < MAX_HDF5_DEPTH:
+                look(node, depth + 1)
+            if not isinstance(node, h5py.Dataset) or node.shape is None:
+                continue
+            if node.is_virtual or node.external:
+                if refuse_links:
+                    raise ValueError(f"{name} lies in other files")
+                continue
+            size = node.size * node.dtype.itemsize
+            piece = math.prod(node.chunks or ()) * node.dtype.itemsize
+            if piece > max(size, MAX_HDF5_PIECE):
+                raise ValueError(f"{name} has {size} bytes in pieces of {piece}")
+            total += size
+            if total > min(most, HDF5_PACKING * file_bytes + MAX_HDF5_PIECE):
+                raise ValueError(f"{file_bytes} bytes unfold to more than {total:.3g}")
+
+    look(opened, 0)
 
 
 def save_data(file: Path, key: str, value: Any) -> None:

@@ -23,6 +23,7 @@ Hertz = Annotated[float, Field(ge=1.0, le=1e13, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 MOST_ELEMENTS = 256
 """Antennas of an array."""
+Element = Annotated[int, Field(ge=0, lt=MOST_ELEMENTS)]
 Places = Annotated[tuple[Place, ...], Field(min_length=1, max_length=MOST_ELEMENTS)]
 
 
@@ -59,7 +60,7 @@ class Description(Node):
     """Samples of a chirp."""
     receivers: Annotated[int, Field(ge=1, le=MOST_ELEMENTS)] | None = None
     """Receive antennas in the file."""
-    chirps: Annotated[tuple[int, ...], Field(min_length=1, max_length=512)] = (0,)
+    chirps: Annotated[tuple[Element, ...], Field(min_length=1, max_length=512)] = (0,)
     """Transmit antenna of each chirp of a loop, counted from 0; every antenna sends equally
     often."""
     loops: Count = 1
@@ -97,7 +98,7 @@ class Description(Node):
 
     def problems(self) -> Iterator[Problem]:
         counts = [self.chirps.count(tx) for tx in range(self.num_tx)]
-        if min(self.chirps) < 0 or len(set(counts)) > 1:
+        if len(set(counts)) > 1:
             yield Problem(
                 (("chirps",),),
                 f"antennas 0 to {self.num_tx - 1} send {counts} times in a loop; let each send "

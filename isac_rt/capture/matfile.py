@@ -18,7 +18,7 @@ import numpy as np
 
 from isac_rt.capture.types import CaptureError
 from isac_rt.runtime import shortly
-from isac_rt.storage import BAD_DATA, read_whole
+from isac_rt.storage import BAD_DATA, check_unfolded, read_whole
 
 Tree = dict[str, Any]
 """Names to arrays, and to the arrays of a struct by name."""
@@ -198,6 +198,7 @@ def _read_hdf5(content: bytes) -> Tree:
 
     found: Tree = {}
     with h5py.File(io.BytesIO(content), "r") as opened:
+        check_unfolded(opened, len(content), MOST_BYTES, refuse_links=False)
         for name in opened:
             if isinstance(opened.get(name, getlink=True), h5py.HardLink) and isinstance(
                 opened[name], h5py.Group

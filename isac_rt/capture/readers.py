@@ -27,7 +27,7 @@ from isac_rt.storage import BAD_DATA, read_whole
 TI_SAMPLING_RATE = 8e6
 """Of TI's calibration captures [Hz], where their file does not state it."""
 MOST_BYTES = 2 * 1024**3
-MOST_META_BYTES = 64 * 1024**2
+MOST_META_BYTES = 8 * 1024**2
 """No description of a recording is larger."""
 SUFFIXES = {
     ".mat": "ti_calibration",
@@ -234,7 +234,7 @@ def _sigmf(file: Path, d: Description) -> Capture:
     base = file.with_suffix("") if file.suffix in (".sigmf-meta", ".sigmf-data") else file
     meta, data = (base.with_name(base.name + end) for end in (".sigmf-meta", ".sigmf-data"))
     try:
-        info = json.loads(_read(meta))["global"]
+        info = json.loads(_read(meta, MOST_META_BYTES))["global"]
         kind = str(info["core:datatype"])
     except BAD_DATA as problem:
         raise CaptureError(f"{meta}: is no SigMF description ({shortly(problem)})") from None
@@ -267,9 +267,14 @@ def _as_stated(meta: Path, info: dict[str, Any], d: Description) -> Description:
     """The description with what the recording says of itself; refused where they differ."""
     rate, channels = (info.get(f"core:{key}") for key in ("sample_rate", "num_channels"))
     for key, value in (("sample_rate", rate), ("num_channels", channels)):
-        if value is not None and not isinstance(value, int | float):
-            raise CaptureError(f"{meta}: core:{key} is {str(value)[:40]!r}, no number; correct it")
+        if value is not None and not _is_finite(value):
+            said = str(value) if isinstance(value, str | float) else type(value).__name__
+            raise CaptureError(f"{meta}: core:{key} is {said[:40]!r}, no number; correct it")
     if channels is not None and channels != 1:  # 1 is what writers state of one interleaved stream
+        if channels != round(channels) or not 1 <= channels <= MOST_ELEMENTS:
+            raise CaptureError(
+                f"{meta}: core:num_channels is {channels:g}, 1 to {MOST_ELEMENTS} can be read"
+            )
         _same(meta, "channels", int(channels), d.receivers)
         if d.axes[-1] != "receiver":
             raise CaptureError(
@@ -281,6 +286,14 @@ def _as_stated(meta: Path, info: dict[str, Any], d: Description) -> Description:
     about = ("sampling rate", "samples/s", 1.0, 1e13)
     found = _stated(meta, np.array(rate, np.float64), d.sampling_rate_hz, about)
     return d.model_copy(update={"sampling_rate_hz": found})
+
+
+def _is_finite(value: Any) -> bool:
+    """Whether a value of JSON is a number that a float holds."""
+    try:
+        return isinstance(value, int | float) and math.isfinite(value)
+    except OverflowError:  # an integer of hundreds of digits
+        return False
 
 
 def read_sigmf(file: str | Path) -> IFCube:
@@ -370,9 +383,9 @@ def _complete(file: Path, d: Description) -> _Complete:
     return _Complete.model_validate(d.model_dump())
 
 
-def _read(file: Path) -> bytes:
+def _read(file: Path, most: int = MOST_BYTES) -> bytes:
     try:
-        return read_whole(file, MOST_BYTES)
+        return read_whole(file, most)
     except OSError as problem:
         raise CaptureError(f"{file}: cannot be read: {problem.strerror}; check the path") from None
 

@@ -11,15 +11,16 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
 from isac_rt.results.recorder import Results
-from isac_rt.runtime import UserError, shortly
+from isac_rt.runtime import UserError, available_memory, shortly
 from isac_rt.scenario.file import to_yaml
-from isac_rt.storage import BAD_DATA, read_whole, write_whole
+from isac_rt.storage import BAD_DATA, check_unfolded, read_whole, write_whole
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -68,6 +69,7 @@ def read_dataset(file: Path) -> xr.Dataset:
     if not file.is_file():
         raise OSError(f"{file} is no file" if file.exists() else f"there is no {file}")
     with h5py.File(file) as whole:
+        check_unfolded(whole, file.stat().st_size, available_memory() or math.inf)
         whole.attrs.get("_nc3_strict")  # where this fails, h5netcdf cannot close what it opened
     with xr.open_dataset(file, engine="h5netcdf") as opened:
         return opened.load()

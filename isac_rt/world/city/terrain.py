@@ -3,6 +3,7 @@ through the feet of its buildings."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,8 @@ FLAT_M = 5.0
 """Feet of nine of ten buildings within this are on flat ground: one plane reflects as a plane."""
 _NODES = 128
 """Of a raster of heights along the longer side: 32,000 triangles."""
+MAX_CELLS, MAX_BLOCK_BYTES = 250_000_000, 2**28
+"""Of a raster's part about the city, and of one of its blocks: each is unpacked as a whole."""
 _RIM = 16
 """Points on each side of a ground that is made through feet."""
 _NEAREST = 6
@@ -211,8 +214,16 @@ def _window(
         raise CityError(
             f"{name}: lies elsewhere than the buildings; check city.crs and city.origin"
         )
+    block = math.prod(raster.block_shapes[0]) * np.dtype(raster.dtypes[0]).itemsize
+    if block > MAX_BLOCK_BYTES:
+        raise CityError(f"{name}: its cells lie in blocks of {block} bytes; write smaller tiles")
     low = np.floor(np.clip(cells[inside].min(axis=0), 0, size - 1)).astype(int)
     high = np.ceil(np.clip(cells[inside].max(axis=0), 0, size - 1)).astype(int) + 1
+    if math.prod((high - low).tolist()) > MAX_CELLS:
+        extent = " x ".join(map(str, (high - low).tolist()))
+        raise CityError(
+            f"{name}: {extent} cells about the city, {MAX_CELLS} can be read; write coarser ones"
+        )
     shape = np.minimum(high - low, 2048)
     window = rasterio.windows.Window(low[1], low[0], *(high - low)[::-1])
     places = (cells - low + 0.5) * shape / (high - low) - 0.5
