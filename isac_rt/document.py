@@ -56,7 +56,11 @@ class ScenarioError(UserError):
 # ---- YAML
 
 
-class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""By libyaml, where PyYAML was built with it."""
+
+
+class Loader(_SafeLoader):
     """Composes at most `MAX_NODES` nodes; only `SCALARS` are told from words."""
 
     nodes = depth = 0
