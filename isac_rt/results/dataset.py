@@ -198,9 +198,6 @@ OBSERVERS: dict[str, Column] = {
         dims=("uav",),
         missing=np.nan,
     ),
-    "shown": _number(
-        "UAV that the city hides, and one wall shows on both ways", "shown", bool, dims=("uav",)
-    ),
     "cooperative": _number("UAV that is a terminal", "cooperative", bool, dims=("uav",)),
     "genie": _number(
         "probability that a matched filter at the true parameters finds the UAV's own path",
@@ -383,11 +380,6 @@ TRACKS: dict[str, Column] = {
         np.int16,
     ),
     "uav": _number("index of the UAV in view that it follows, -1: none", "tracks.uav", np.int16),
-    "mirror": _number(
-        "placed where a wall shows a UAV out of sight: 0 no, 1 where none is, 2 rightly",
-        "tracks.mirror",
-        np.int8,
-    ),
 }
 
 

@@ -46,8 +46,6 @@ class TrackTable:
     kind, target : of the path that explains the latest detection that updated it: `PathKind` and
         index of the UAV involved, -1: none
     uav : index of the UAV in view that it follows (`isac_rt.results.scoring`), -1: none
-    mirror : whether it is placed where a wall shows a UAV out of sight (`tracking.mirrors`): 0 no,
-        1 yes, where none is, 2 yes, rightly
     """
 
     id: np.ndarray
@@ -61,7 +59,6 @@ class TrackTable:
     kind: np.ndarray
     target: np.ndarray
     uav: np.ndarray
-    mirror: np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,8 +78,6 @@ class ObserverRecord:
     state : code of the terminal's state, an index into the recorder's `states`
     hit : (U,) bool; whether a UAV in view and unshadowed was found by its own path, within one
         resolution on all four axes
-    shown : (U,) bool; whether a UAV that the city hides from an active terminal is shown to it by
-        one wall on both ways, strongly enough for a coherent matched filter
     loss : (U,) `isac_rt.results.losses.Loss` of every UAV in view and unshadowed, -1 of the others
     target_snr : (U,) SNR of its own path behind a matched filter that is coherent over the whole
         frame (linear), NaN where it is not in view or shadowed
@@ -120,7 +115,6 @@ class ObserverRecord:
     tracks: TrackTable
     state: int
     hit: np.ndarray
-    shown: np.ndarray
     loss: np.ndarray
     target_snr: np.ndarray
     target_clutter: np.ndarray

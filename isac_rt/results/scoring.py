@@ -21,7 +21,7 @@ from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections, Reception
 from isac_rt.results.bounds import CramerRao
 from isac_rt.results.labels import Aim, Places, explain, owners
-from isac_rt.results.losses import MATCHED_DB, Chance, Sensitivity, cause_of
+from isac_rt.results.losses import Chance, Sensitivity, cause_of
 from isac_rt.results.metrics import (
     GOSPA_CUTOFF_M,
     SymbolCount,
@@ -39,8 +39,6 @@ from isac_rt.world.swarm import Swarm
 GATE_RESOLUTIONS = 3.0
 """An estimate farther from a UAV than so many resolutions on some axis does not stand for it, even
 if the UAV's own path caused it: an alias, a range misread, a track that has drifted off."""
-SAME_WAY = 1e-6
-"""Most that directions of departure and arrival of one way differ, by rounding."""
 MISREAD = 0.5
 """Share of wrong delay symbols from which on a data frame shows nothing in its place."""
 
@@ -132,7 +130,6 @@ class Scorer:
             tracks=table,
             state=heard.state,
             hit=hit,
-            shown=self._shown(view, paths, sees),
             loss=loss,
             bound=self._bound(view, chances),
             target_snr=_by_uav({i: c.matched for i, c in chances.items()}, len(hit)),
@@ -142,14 +139,10 @@ class Scorer:
             clutter_free=_by_uav(
                 {i: sees.clutter_free(c.cell) for i, c in chances.items()}, len(hit)
             ),
-            gospa=gospa(
-                view.places, tracks.mean[tracks.confirmed & (table.mirror < 2), :3], GOSPA_CUTOFF_M
-            ),
+            gospa=gospa(view.places, tracks.mean[tracks.confirmed, :3], GOSPA_CUTOFF_M),
             gospa_targets=gospa(
                 view.places[~friends[list(view.seen)]],
-                tracks.mean[
-                    tracks.confirmed & (table.mirror < 2) & ~self._of_friends(tracks, friends), :3
-                ],
+                tracks.mean[tracks.confirmed & ~self._of_friends(tracks, friends), :3],
                 GOSPA_CUTOFF_M,
             ),
             **{f"detection_{name}": value for name, value in vars(labels).items() if name != "uav"},
@@ -195,9 +188,7 @@ class Scorer:
         seen = {i: t for i, t in enumerate(truth) if t is not None and inside[i] and direct[i]}
         everyone = np.array([poses[name].position - own.position for name in names])
         directions = own.to_body(paths.arrival)[:, ::2]
-        return _View(
-            truth, inside, direct, straight, seen, everyone[list(seen)], everyone, directions
-        )
+        return _View(truth, inside, direct, straight, seen, everyone[list(seen)], directions)
 
     def _sensitivity(self, frame: int, sent: Transmission, noise_power: float) -> Sensitivity:
         timetable = self._timetable
@@ -278,36 +269,7 @@ class Scorer:
             kind=kind,
             target=target,
             uav=follows,
-            mirror=self._mirror(view, tracks, kind, target),
         )
-
-    def _mirror(
-        self, view: _View, tracks: TrackSet, kind: np.ndarray, target: np.ndarray
-    ) -> np.ndarray:
-        """(K,) `TrackTable.mirror`: rightly placed is a track that an echo of a hidden UAV over
-        walls fed last, within GOSPA's cutoff of that UAV."""
-        out = tracks.mirrored.astype(np.int8)
-        for k in np.flatnonzero(tracks.mirrored & (kind == PathKind.GHOST) & (target >= 0)):
-            place = view.everyone[target[k]]
-            near = np.linalg.norm(tracks.mean[k, :3] - place) < GOSPA_CUTOFF_M
-            out[k] += near and not view.direct[target[k]]
-        return out
-
-    def _shown(self, view: _View, paths: PathSet, sees: Sensitivity) -> np.ndarray:
-        """(U,) `ObserverRecord.shown`."""
-        out = np.zeros(len(view.truth), bool)
-        if self._passes == 1:
-            return out
-        half = self._timetable.waveform.frame_duration / 2
-        paths = paths.select((paths.kind == PathKind.GHOST) & (paths.bounces == 2))
-        life = np.minimum(paths.end, half) - np.maximum(paths.begin, -half)
-        matched = sees.matched * np.maximum(life, 0) / (2 * half) * paths.power
-        twice = matched >= 10 ** (MATCHED_DB / 10)
-        # the same way there and back is over one wall
-        twice &= (np.abs(paths.departure - paths.arrival) < SAME_WAY).all(axis=1)
-        index = [list(self._swarm.uavs).index(name) for name in paths.target_names]
-        out[[index[t] for t in paths.target[twice]]] = True
-        return out & ~view.direct
 
     def _of_friends(self, tracks: TrackSet, friends: np.ndarray) -> np.ndarray:
         """(K,) which tracks a terminal's own path fed last; the reference is one."""
@@ -351,7 +313,6 @@ class _View:
     straight : (K,) index of the UAV whose own straight path each path is, -1: none's
     seen : the truth of those in view and unshadowed, by index
     places : (S, 3) of these, relative to the receiver [m]
-    everyone : (U, 3) the same of all UAVs
     directions : (K, 2) u_x, u_z from which each path arrives
     """
 
@@ -361,7 +322,6 @@ class _View:
     straight: np.ndarray
     seen: dict[int, Truth]
     places: np.ndarray
-    everyone: np.ndarray
     directions: np.ndarray
 
 

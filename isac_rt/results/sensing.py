@@ -42,10 +42,7 @@ class Sensing:
         parameters, and by the receiver's detector in noise alone
     gospa, gospa_targets : (F, 3) localisation, missed, false [m^2]; of all, and without terminals
     num_false, num_clutter : (F,) detections
-    shown : (F, U) bool, hidden, and strongly enough shown by one wall
-    mirrored : (F, 2) confirmed tracks placed by a wall where no UAV is, and rightly
-    false_tracks : (F, kinds + 1) confirmed tracks that follow no UAV in view, by `FALSE_CAUSES`,
-        without those rightly placed by a wall
+    false_tracks : (F, kinds + 1) confirmed tracks that follow no UAV in view, by `FALSE_CAUSES`
     ghosts : (F, U) those of them that ghosts of each UAV feed
     """
 
@@ -65,8 +62,6 @@ class Sensing:
     gospa_targets: np.ndarray
     num_false: np.ndarray
     num_clutter: np.ndarray
-    shown: np.ndarray
-    mirrored: np.ndarray
     false_tracks: np.ndarray
     ghosts: np.ndarray
 
@@ -101,8 +96,7 @@ class Sensing:
             np.add.at(out, (frame[of], what[of]), 1)
             return out
 
-        confirmed, mirror = tracks["confirmed"] > 0, tracks["mirror"]
-        false = confirmed & (tracks["uav"] < 0) & (mirror < 2)
+        false = (tracks["confirmed"] > 0) & (tracks["uav"] < 0)
         kind, ghost_of = tracks["kind"], tracks["target"]
         ghost = false & (kind == PathKind.GHOST) & (ghost_of >= 0)
         return cls(
@@ -121,8 +115,6 @@ class Sensing:
             parts("gospa_targets"),
             np.array(values["num_false"]),
             np.array(values["num_clutter"]),
-            np.array(values["shown"]),
-            counted(mirror - 1, confirmed & (mirror > 0), 2),
             counted(np.where(kind < 0, len(KINDS), kind), false, len(FALSE_CAUSES)),
             counted(ghost_of, ghost, num_uavs),
         )
@@ -166,11 +158,6 @@ class Sensing:
             "false_tracks": {
                 name: share(int(n), frames) for name, n in zip(FALSE_CAUSES, false, strict=True)
             },
-            "mirrors": {
-                "shown": int(self.shown.sum()),
-                "placed": int(self.mirrored.sum()),
-                "right": int(self.mirrored[:, 1].sum()),
-            },
             "losses": _counts(self.loss),
         }
 
@@ -185,7 +172,6 @@ class Sensing:
         return {
             "in_view": int(self.seen[:, i].sum()),
             "hidden": int(self.hidden[:, i].sum()),
-            "shown": int(self.shown[:, i].sum()),
             "found": int(self.hit[:, i].sum()),
             "tracked": int(followed.sum()),
             "switches": int(self.switched[:, i].sum()),

@@ -22,7 +22,7 @@ PLAIN: dict[str, dict[str, Any]] = {
         "update_false_alarm_rate": None,
         "gate_false_alarm_rate": None,
     },
-    "tracking": {"drop_after_s": None, "births": "all", "mirrors": "ignore"},
+    "tracking": {"drop_after_s": None, "births": "all"},
 }
 
 
@@ -48,7 +48,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "update_false_alarm_rate": 1e-4,
             "gate_false_alarm_rate": 1e-3,
         },
-        "tracking": {"drop_after_s": 0.36, "births": "unexplained", "mirrors": "ignore"},
+        "tracking": {"drop_after_s": 0.36, "births": "unexplained"},
     },
 }
 """What each preset says of `receivers` and `tracking`, all of them of the same keys; of the rest

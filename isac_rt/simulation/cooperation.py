@@ -262,8 +262,7 @@ def _corrected(count: SymbolCount) -> bool:
 
 
 def look_of(link: Link, frame: int, time: float, own: Pose, heard: Heard, clock_std: float) -> Look:
-    """The detections of a frame that a receiver's tracks took. The reference's is left out, and
-    so are those by way of a wall, which show no body where they point.
+    """The detections of a frame that a receiver's tracks took. The reference's is left out.
 
     Parameters
     ----------
@@ -272,7 +271,7 @@ def look_of(link: Link, frame: int, time: float, own: Pose, heard: Heard, clock_
     clock_std : deviation of its ranges by its clock [m]
     """
     tracks, found = heard.tracks, in_plane(heard.reception.detections)
-    straight = ~tracks.is_reference & ~tracks.mirrored
+    straight = ~tracks.is_reference
     mine = (tracks.detection >= 0) & straight
     rows = tracks.detection[mine]
     return Look(

@@ -521,14 +521,3 @@ def distance(y: np.ndarray, S: np.ndarray, work: np.ndarray) -> tuple[float, flo
         d2 += w[i] ** 2
         log_det += 2 * np.log(L[i, i])
     return d2, log_det
-
-
-def reflected(plane: np.ndarray, state: Gaussian) -> Gaussian:
-    """A body's image in a plane (4,): places are turned over in it, and all motions and
-    covariances with them."""
-    normal = plane[:3]
-    turn = np.eye(3) - 2 * np.outer(normal, normal)
-    mean = (state.mean.reshape(-1, 3) @ turn.T).ravel()
-    mean[:3] += 2 * plane[3] * normal
-    whole = np.kron(np.eye(mean.size // 3), turn)
-    return Gaussian(mean, whole @ state.covariance @ whole.T)

@@ -22,7 +22,6 @@ from isac_rt.kernels.jit import jit
 from isac_rt.receive.types import Detections
 from isac_rt.terminal.filter import Gaussian, wrapped
 from isac_rt.terminal.ghosts import Leeway, Walls, suspicion
-from isac_rt.terminal.mirrors import mirror_of
 from isac_rt.terminal.tracker import Track, Tracker, track_set
 from isac_rt.world.swarm import Pose
 
@@ -55,14 +54,12 @@ class Doubts:
     antennas : Antennas
     waveform : Waveform
     passes : 2 at an active terminal, 1 at a passive one
-    places : whether tracks behind a wall are placed where the wall shows them (`tracking.mirrors`)
     """
 
     walls: Walls
     antennas: Antennas
     waveform: Waveform
     passes: int = 2
-    places: bool = False
 
     def births(
         self, detections: Detections, own: Pose, sender: np.ndarray | None = None
@@ -97,38 +94,27 @@ class Doubts:
         """Take out the tracks, among those `new` to be confirmed, that a wall explains, and of
         the others those that are a nearer body's echoes over a wall frame after frame, or that went
         behind one; at a passive terminal with its `reference`. Of bodies that were `told` echoes
-        are known as well as of tracks. Where mirrors are eyes, those stay that a wall shows and
-        nothing else explains, as long as it does."""
-        old = {t.id for t in tracker.tracks if t.mirror.size}
+        are known as well as of tracks."""
         confirmed = {t.id for t in tracker.tracks if t.confirmed}
-        hidden = set(old)
-        out: set[int] = set()
-        if confirmed - old:
-            tracks = tracker.snapshot(own, reference)
-            crossing = {
-                t.id
-                for t in tracker.tracks
-                if t.id in confirmed - new - old and self.walls.within(t.state.mean[:3], CROSSING_M)
-            }
-            asked = np.isin(tracks.ids, [*(confirmed & new | crossing)]) & ~tracks.is_reference
-            others = track_set([Track.of_body(body) for body in told], own, reference)
-            said = suspicion(tracks, own, self.walls, self._leeway, others, asked)
-            out = confirmed & new & set(tracks.ids[said.suspect].tolist())
-            echoes = set(tracks.ids[said.suspect].tolist())
-            for track in tracker.tracks:
-                track.echoed = track.echoed + 1 if track.id in echoes else 0
-                if track.echoed >= ECHOED_FRAMES:
-                    out.add(track.id)
-            if self.places:
-                hidden |= out & set(tracks.ids[said.mirrored < 0].tolist())
+        if not confirmed:
+            return
+        tracks = tracker.snapshot(own, reference)
+        crossing = {
+            t.id
+            for t in tracker.tracks
+            if t.id in confirmed - new and self.walls.within(t.state.mean[:3], CROSSING_M)
+        }
+        asked = np.isin(tracks.ids, [*(confirmed & new | crossing)]) & ~tracks.is_reference
+        others = track_set([Track.of_body(body) for body in told], own, reference)
+        said = suspicion(tracks, own, self.walls, self._leeway, others, asked)
+        suspect = set(tracks.ids[said.suspect].tolist())
         for track in tracker.tracks:
-            if track.id in hidden:
-                track.mirror = mirror_of(
-                    track.state, own, self.walls, float(self._leeway.resolution[0])
-                )
-        shown = {t.id for t in tracker.tracks if t.mirror.size}
-        out = (out | old) - shown
-        tracker.tracks = [t for t in tracker.tracks if t.id not in out]
+            track.echoed = track.echoed + 1 if track.id in suspect else 0
+        tracker.tracks = [
+            t
+            for t in tracker.tracks
+            if t.echoed < ECHOED_FRAMES and not (t.id in suspect and t.id in confirmed & new)
+        ]
 
     @cached_property
     def _leeway(self) -> Leeway:

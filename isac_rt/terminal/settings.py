@@ -14,6 +14,9 @@ class Tracking(Node):
     """The Kalman filters, and when a track begins and ends."""
 
     KEEPS_NULL: ClassVar[bool] = True
+    REMOVED: ClassVar[dict[str, str]] = {
+        "mirrors": "leave it out: tracks behind a wall are not confirmed with births: unexplained"
+    }
 
     acceleration_std_mps2: Positive = 3.0
     """Standard deviation of a UAV's acceleration along each axis, held for about a second (Singer's
@@ -47,11 +50,6 @@ class Tracking(Node):
     which no frame shows both are one. With `cooperation` a passive terminal confirms none before
     its sixth frame: until then the active one cannot have told it what flies near its line of
     sight."""
-    mirrors: Literal["ignore", "place"] = "ignore"
-    """What becomes of a track behind a wall of the mesh, with `births: unexplained`, at an active
-    terminal. `ignore`, the default: it is not confirmed. `place`: if it moves, is no echo of a
-    nearer track over a wall and the wall can show the place, it is taken for the image of a UAV out
-    of sight, and reported where that UAV is."""
 
     @property
     def needs_mesh(self) -> bool:
@@ -64,12 +62,6 @@ class Tracking(Node):
                 (("confirm_hits",), ("confirm_window",)),
                 f"{self.confirm_hits} hits cannot be reached within confirm_window = "
                 f"{self.confirm_window}; lower it or widen the window",
-            )
-        if self.mirrors == "place" and self.births == "all":
-            yield Problem(
-                (("mirrors",), ("births",)),
-                "place has no meaning with births all, only with unexplained; leave it out, or "
-                "change births",
             )
 
 

@@ -146,8 +146,7 @@ class ActiveTerminal:
         if tracking.births == "unexplained":
             if walls is None:
                 raise ValueError("tracking.births unexplained needs the walls of a city")
-            places = tracking.mirrors == "place"
-            self._doubts = Doubts(walls, antennas, waveform, places=places)
+            self._doubts = Doubts(walls, antennas, waveform)
         self.calibration = calibration_of(receivers, waveform, antennas, 2)
         self._standing = Standing.of(antennas, waveform, 2, walls)
         self._correction: Correction | None = None

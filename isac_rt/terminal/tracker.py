@@ -23,7 +23,6 @@ from isac_rt.terminal.filter import (
     expected,
     measurement_covariance,
     predict,
-    reflected,
     reported,
     update,
 )
@@ -84,8 +83,6 @@ class Track:
     confirmed : M hits in N frames were reached, `SURE_HITS` of them sure
     detection : row among the frame's detections that updated it, -1: none
     last : time of the last detection [s]
-    mirror : (4,) plane of the wall by which the body is seen, of which the state is the image;
-        (0,): it is seen straight
     echoed : frames in a row that it fits a nearer body's echo over a wall, or lies behind one
     sure : detections that could have started it
     """
@@ -99,7 +96,6 @@ class Track:
     confirmed: bool = False
     detection: int = -1
     last: float = -np.inf
-    mirror: np.ndarray = field(default_factory=lambda: np.zeros(0))
     echoed: int = 0
     sure: int = 1
 
@@ -140,8 +136,6 @@ class TrackSet:
     age : (K,) int, frames since the first detection
     confirmed, is_reference : (K,) bool; the reference is a PT's track of its AT
     detection : (K,) int, row among the frame's detections that updated it, -1: none
-    mirrored : (K,) bool, seen by one wall (`tracking.mirrors`): `mean` and `covariance` are of the
-        body, and `range`, `velocity` and `direction` of its image. By default none
     """
 
     ids: np.ndarray
@@ -155,11 +149,6 @@ class TrackSet:
     confirmed: np.ndarray
     is_reference: np.ndarray
     detection: np.ndarray
-    mirrored: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
-
-    def __post_init__(self) -> None:
-        if self.mirrored.size != self.ids.size:
-            object.__setattr__(self, "mirrored", np.zeros(self.ids.size, bool))
 
     def __len__(self) -> int:
         return self.ids.shape[0]
@@ -191,8 +180,6 @@ def united(tracks: Sequence[Track]) -> list[Track]:
 def _of_one_body(a: Track, b: Track) -> bool:
     if not (a.confirmed and b.confirmed) or min(a.detection, b.detection) >= 0:
         return False
-    if a.mirror.size or b.mirror.size:
-        return False
     spread = max(np.diag(t.state.covariance)[:3].max() for t in (a, b))
     apart = np.linalg.norm(a.state.mean[:3] - b.state.mean[:3])
     return bool(apart < LEAST_APART and spread < LEAST_APART**2)
@@ -203,11 +190,10 @@ def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None
     bistatic."""
     everyone = ([] if reference is None else [reference]) + list(tracks)
     count = len(everyone)
-    bodies = [reflected(t.mirror, t.state) if t.mirror.size else t.state for t in everyone]
-    mean = np.array([b.mean[:6] for b in bodies]).reshape(count, 6)
-    covariance = np.array([b.covariance[:6, :6] for b in bodies]).reshape(count, 6, 6)
-    is_reference = np.arange(count) < (reference is not None)
     states = [t.state for t in everyone]
+    mean = np.array([s.mean[:6] for s in states]).reshape(count, 6)
+    covariance = np.array([s.covariance[:6, :6] for s in states]).reshape(count, 6, 6)
+    is_reference = np.arange(count) < (reference is not None)
     if reference is None:
         z, std = reported(states, own)
     else:
@@ -225,7 +211,6 @@ def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None
         confirmed=np.array([t.confirmed for t in everyone], bool),
         is_reference=is_reference,
         detection=np.array([t.detection for t in everyone], np.int64),
-        mirrored=np.array([t.mirror.size > 0 for t in everyone], bool),
     )
 
 

@@ -320,27 +320,11 @@ def false_table(summary: Mapping[str, Any]) -> Table:
     return Table(("False tracks per frame", "All", *titles), rows)
 
 
-def mirror_table(summary: Mapping[str, Any]) -> Table:
-    """UAVs out of sight that walls show, and what terminals made of it: one row for each link that
-    was shown any or placed any."""
-    rows = []
-    for name, s in summary["links"].items():
-        m = s.get("mirrors", {})
-        if any(m.values()):
-            wrong = m["placed"] - m["right"]
-            rows.append(
-                (link_words(name), *map(number, (m["shown"], m["placed"], m["right"], wrong)))
-            )
-    return Table(("Out of sight, by a wall", "Shown", "Placed", "Right", "Wrong"), rows)
-
-
-def _targets(
-    summary: Mapping[str, Any], *keys: str
-) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """(link, UAV, figures) of what was in view at some time, or any of the `keys` if there are."""
+def _targets(summary: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """(link, UAV, figures) of what was in view at some time."""
     for link, s in summary["links"].items():
         for uav, t in s.get("targets", {}).items():
-            if any(t.get(key) for key in keys or ("in_view",)):
+            if t["in_view"]:
                 yield link_words(link), uav, t
 
 
@@ -376,23 +360,13 @@ def _pairs(middle: Mapping[str, float | None], most: Mapping[str, float | None])
 
 
 def loss_table(summary: Mapping[str, Any]) -> Table:
-    """What became of every target-frame in view, and those out of sight that a wall shows; causes
-    that never were are left out."""
-    rows = list(_targets(summary, "in_view", "shown"))
+    """What became of every target-frame in view; causes that never were are left out."""
+    rows = list(_targets(summary))
     causes = [c for c in LOSSES if any(t["losses"][c] for _, _, t in rows)]
-    by_wall = any(t.get("shown") for _, _, t in rows)
     titles = (cause.replace("_", " ").capitalize() for cause in causes)
     return Table(
-        ("Link", "UAV", *titles, *["By a mirror only"] * by_wall),
-        [
-            (
-                link,
-                uav,
-                *(number(t["losses"][c]) for c in causes),
-                *[number(t.get("shown"))] * by_wall,
-            )
-            for link, uav, t in rows
-        ],
+        ("Link", "UAV", *titles),
+        [(link, uav, *(number(t["losses"][c]) for c in causes)) for link, uav, t in rows],
     )
 
 

@@ -47,7 +47,6 @@ TERMINAL_KEYS = {
     "gospa",
     "apart",
     "bounds",
-    "mirrors",
     "false_tracks_per_frame",
     "false_tracks",
     "losses",

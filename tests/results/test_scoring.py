@@ -309,53 +309,6 @@ def test_gospa_is_of_confirmed_tracks_and_uavs_in_view():
     assert {*table.kind, *table.target, *table.uav} == {-1}
 
 
-def test_a_uav_out_of_sight_that_a_wall_shows():
-    """U1 has no straight path, but an echo of 16 dB over one wall on both ways: it is shown. Of
-    12.5 dB it is not, nor over two walls, nor where it is in sight too. A track that a wall places
-    0.3 m from it, fed by that echo, is right and is not in GOSPA; 7 m off it is wrong, and fed by
-    clutter too. Planted bugs: another way back taken for the same; UAVs in sight
-    shown; any echo of it right wherever the track is."""
-    direct = path_of("AT", "U2", DATA, 3.0)
-    echo = {**path_of("AT", "U1", DATA, FAINT * 1.5, PathKind.GHOST), "target": NAMES.index("U1")}
-
-    def shown(rows, **changes):
-        paths = pathset("AT", rows)
-        bounces = np.where(paths.kind == PathKind.GHOST, 2, 0)
-        paths = replace(paths, **{"bounces": bounces, **changes})
-        return rate(paths)
-
-    def rate(paths, tracks=(), points=(), placed=()):
-        judge, pose = scorer("AT"), SWARM.poses(TIMETABLE.epoch(DATA))["AT"]
-        sent = Transmission(
-            name="AT",
-            pose=pose,
-            antennas=ANTENNAS,
-            schedule=TIMETABLE.schedule,
-            payload=TIMETABLE.payload("AT", DATA),
-        )
-        found = track_set("AT", DATA, tracks)
-        found = replace(found, mirrored=np.array(placed, bool))
-        heard = Heard(Reception.undecoded(W, detections(points)), found, 1)
-        return judge.record(DATA, paths, sent, heard, NOISE)
-
-    assert shown([direct, echo]).shown.tolist() == [True, False, False, False]
-    faint = {**echo, "gain": FAINT}
-    assert not shown([direct, faint]).shown.any()
-    assert not shown([direct, echo, path_of("AT", "U1", DATA, 1.0)]).shown.any()
-    other = np.array([[0.0, 1.0, 0.0], [0.6, 0.8, 0.0]])
-    assert not shown([direct, echo], departure=other).shown.any()
-    place = point("AT", "U1", DATA, OWN)
-    paths = pathset("AT", [direct, {**echo, "gain": 30.0}])
-    for east, placed, expected in ((0.3, True, 2), (7.0, True, 1), (0.3, False, 0)):
-        record = rate(paths, [(1, True, 0, "U1", east)], [place], [placed])
-        assert record.tracks.mirror.tolist() == [expected]
-        if east < 1:
-            assert record.gospa.false == pytest.approx(0.0 if expected == 2 else 12.5)
-    clutter = pathset("AT", [direct, path_of("AT", "U1", DATA, 30.0, PathKind.DIFFUSE)])
-    record = rate(clutter, [(1, True, 0, "U1", 0.3)], [place], [True])
-    assert record.tracks.mirror.tolist() == [1]
-
-
 def test_targets_are_scored_without_the_terminals():
     """U1 with a track 0.3 m off, PT1 with one of its own path 2 m off that coasts in the next
     frame, and a wall's track at U2, who is not in view: of all there is one false track, of targets

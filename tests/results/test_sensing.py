@@ -22,7 +22,6 @@ def row(seen=(1, 1), errors=(None, None), tracks=(), **more):
     tracks of (id, confirmed, kind, target, followed UAV)."""
     seen = np.array(seen, bool)
     out = {"in_view": seen, "shadowed": np.zeros(2, bool), "hit": np.zeros(2, bool)}
-    out["shown"] = np.zeros(2, bool)
     out |= {"loss": np.where(seen, Loss.OTHER, -1), "num_false": 0, "num_clutter": 0, **GOSPA}
     out |= {"cooperative": np.array([False, True])}
     out |= {
@@ -31,7 +30,6 @@ def row(seen=(1, 1), errors=(None, None), tracks=(), **more):
     }
     table = np.array(tracks, int).reshape(-1, 5)
     out["track"] = dict(zip(("id", "confirmed", "kind", "target", "uav"), table.T, strict=True))
-    out["track"]["mirror"] = np.zeros(len(table), int)
     for k, name in enumerate(MEASURES):
         truth = np.array([17.3, -2.9])
         out[f"truth_{name}"] = truth
@@ -157,24 +155,6 @@ def test_false_tracks_by_cause():
     assert block["false_tracks"] == dict.fromkeys(FALSE_CAUSES, 0.0) | expected
     assert block["false_tracks_per_frame"] == pytest.approx(2.5)
     assert [t["ghost_tracks"] for t in s.targets(["U1", "U2"]).values()] == [0, 2]
-
-
-def test_tracks_that_a_wall_places():
-    """Of three confirmed tracks that follow nobody, one is placed wrongly by a wall and one is
-    placed rightly, which is not false; a tentative one counts nowhere. Planted bugs: both are
-    false; none is."""
-    wall = int(PathKind.SPECULAR)
-    tracks = [
-        (1, 1, wall, -1, -1),
-        (2, 1, wall, -1, -1),
-        (3, 1, wall, -1, -1),
-        (4, 0, wall, -1, -1),
-    ]
-    one = row(tracks=tracks)
-    one["track"]["mirror"] = np.array([0, 1, 2, 2])
-    block = sensing([one, row()]).block()
-    assert block["false_tracks_per_frame"] == pytest.approx(2 / 2)
-    assert (block["mirrors"]["placed"], block["mirrors"]["right"]) == (2, 1)
 
 
 def test_switches_and_interruptions():

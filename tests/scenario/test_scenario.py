@@ -177,10 +177,6 @@ def test_scenes_load_without_doubts_and_round_trip(path, tmp_path):
             "receivers.clutter_run_cells = 20: has no meaning with clutter_filter zero_doppler",
         ),
         (
-            BASE + "tracking: {mirrors: place}\n",
-            "tracking.mirrors = place: place has no meaning with births all, only with unexplained",
-        ),
-        (
             BASE + "tracking: {confirm_hits: 6}\n",
             "tracking.confirm_hits = 6: 6 hits cannot be reached within confirm_window = 5",
         ),

@@ -191,17 +191,15 @@ def test_the_report_and_the_moving_picture_show_the_pictures(talked):
     assert marks["its picture with what it hears"] == pytest.approx([here], abs=1.0)
 
 
-def test_what_a_wall_shows_is_not_told_as_a_detection():
-    """Of two tracks that a frame has fed, one is of a body's image behind a wall: its detection
-    points where nobody is, and bodies that rest on it are to end. Planted bug: all but the
-    reference are told."""
+def test_a_reference_is_not_told_as_a_detection():
+    """Of two tracks that a frame has fed, one is the transmitter's, which says itself where it is.
+    Planted bug: all tracks are told."""
     own = Pose.at_rest((0.0, 0.0, 20.0), (0, 1, 0))
     states = [np.array([1.0, 20, 22, 0, 3, 0, 0, 0, 0]), np.array([9.0, 31, 24, 1, 2, 0, 0, 0, 0])]
     tracks = [
         Track(k, Gaussian(mean, np.eye(9)), 50.0, confirmed=True, detection=1 - k)
         for k, mean in enumerate(states)
     ]
-    tracks[1].mirror = np.array([1.0, 0.0, 0.0, 5.0])
     z = np.array([measure(mean, own) for mean in states[::-1]])
     found = Detections(
         range=z[:, 0],
@@ -212,8 +210,8 @@ def test_what_a_wall_shows_is_not_told_as_a_detection():
         is_reference=np.zeros(2, bool),
     )
     waveform = Waveform(num_samples=256)
-    heard = Heard(Reception.undecoded(waveform, found), track_set(tracks, own), 1)
-    look = look_of(Link("AT", "AT"), 3, 0.15, own, heard, 0.0)
+    heard = Heard(Reception.undecoded(waveform, found), track_set(tracks[:1], own, tracks[1]), 1)
+    look = look_of(Link("AT", "PT1"), 3, 0.15, own, heard, 0.0)
     assert look.numbers.tolist() == [0] and look.kept == (0,)
     np.testing.assert_allclose(look.z, z[1:])
 

@@ -16,7 +16,6 @@ from isac_rt.views.tables import (
     false_table,
     gospa_table,
     loss_table,
-    mirror_table,
     per_terminal,
     target_table,
 )
@@ -88,13 +87,8 @@ def test_walls_behind_what_was_seen():
 
 
 def test_why_not(summary):
-    """Causes that never were have no column, nor have walls where they show nothing. Planted bug:
-    the column of walls always there."""
-    dark = copy.deepcopy(summary)
-    for block in dark["links"].values():
-        for target in block["targets"].values():
-            target["shown"] = 0
-    table = loss_table(dark)
+    """Causes that never were have no column."""
+    table = loss_table(summary)
     assert table.columns == ("Link", "UAV", "Found", "Inaccurate")
     assert row(table, "AT to PT1", "U1") == {
         "Link": "AT to PT1",
@@ -116,27 +110,12 @@ def test_picture(summary):
     }
 
 
-def test_what_walls_show(summary):
-    """A wall shows U1 to the AT in three frames, and it is never in view there; of five placed
-    tracks two are wrong. A link without a wall that shows anything has no row. Planted bugs: placed
-    for wrong; a UAV that is only ever shown left out."""
-    seen = copy.deepcopy(summary)
-    seen["links"]["AT->AT"]["mirrors"] = {"shown": 3, "placed": 5, "right": 3}
-    (target,) = (t for u, t in seen["links"]["AT->AT"]["targets"].items() if u == "U1")
-    target |= {"in_view": 0, "shown": 3}
-    (found,) = mirror_table(seen).rows
-    assert found == ("AT to AT", "3", "5", "3", "2")
-    table = loss_table(seen)
-    assert row(table, "AT to AT", "U1")["By a mirror only"] == "3"
-    assert row(table, "AT to PT1", "U1")["By a mirror only"] == "0"
-
-
 def test_summaries_of_earlier_versions_have_none(summary):
     old = copy.deepcopy(summary)
     for block in old["links"].values():
-        for key in ("gospa", "false_tracks", "targets", "mirrors"):
+        for key in ("gospa", "false_tracks", "targets"):
             del block[key]
-    tables = gospa_table, false_table, target_table, error_table, loss_table, mirror_table
+    tables = gospa_table, false_table, target_table, error_table, loss_table
     for table in tables:
         assert not table(old).rows
 
@@ -150,7 +129,6 @@ def test_tables_fit_the_page(summary):
         block["false_tracks"] = dict.fromkeys(block["false_tracks"], 12.3456)
         for target in block["targets"].values():
             target["losses"] = dict.fromkeys(target["losses"], 1234)
-            target["shown"] = 1234
             for key in ("median", "p90", "bound_median", "bound_p90"):
                 target[key] = dict.fromkeys(target[key], 0.00012345)
     for table in (gospa_table, false_table, target_table, error_table, loss_table):
