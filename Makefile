@@ -67,7 +67,7 @@ test: setup
 	@$(BIN)/python -m pytest -q --durations=10 --numprocesses 2 --dist loadfile
 
 demo: setup
-	@$(BIN)/isac-rt run scenes/munich_swarm.yaml --out out/munich_swarm --set compare.paper.preset=paper
+	@$(BIN)/isac-rt run scenes/munich_swarm.yaml --out out/munich_swarm --set compare.paper.preset=paper --overwrite
 
 notebook: setup
 	@$(BIN)/jupyter lab notebooks

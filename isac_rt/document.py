@@ -56,8 +56,10 @@ class ScenarioError(UserError):
 # ---- YAML
 
 
-_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""By libyaml, where PyYAML was built with it."""
+if typing.TYPE_CHECKING:
+    _SafeLoader = yaml.SafeLoader
+else:  # by libyaml, where PyYAML was built with it
+    _SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class Loader(_SafeLoader):

@@ -47,6 +47,10 @@ def run(
         bool,
         typer.Option("--restart", help="Let go of frames that a stopped run kept in DIR."),
     ] = False,
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite", help="Replace the results of another scenario in DIR."),
+    ] = False,
     overrides: Overrides = None,
 ) -> None:
     """Simulate a scenario: results, summary, figures and a report. After a stop the same command
@@ -55,7 +59,13 @@ def run(
 
     loaded = load(scenario, overrides or (), frames, seed)
     folder = out if out is not None else Path("runs") / loaded.name
-    with ending_soon_after_interrupt(folder):
+    from isac_rt.results.files import check_folder
+    from isac_rt.simulation.resume import check_replaces_nothing, sole_use
+
+    check_folder(folder)
+    with sole_use(folder), ending_soon_after_interrupt(folder):
+        if not overwrite:
+            check_replaces_nothing(folder, loaded)
         _run(loaded, folder, snapshots, check_budget, restart)
     say(f"results in {folder}: report.html, results.nc, summary.json, scenario.yaml, figures/")
 
@@ -72,14 +82,13 @@ def demo(
     scenario = out / "demo.yaml"
     if not scenario.exists():
         write_starter(scenario)
-    run(scenario, out / "results", frames=12)
+    run(scenario, out / "results", frames=12, overwrite=True)
     say(f"next: change {scenario}, then isac-rt run {scenario}")
 
 
 def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, restart: bool) -> None:
-    from isac_rt.results.files import check_folder, save
+    from isac_rt.results.files import save
 
-    check_folder(folder)
     with working("loading the program"):
         from isac_rt.kernels.jit import compilations_logged, use_whole_registers
         from isac_rt.results.provenance import run_content

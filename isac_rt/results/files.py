@@ -12,6 +12,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,12 +21,14 @@ from pydantic import BaseModel
 from isac_rt.results.recorder import Results
 from isac_rt.runtime import UserError, available_memory, shortly
 from isac_rt.scenario.file import to_yaml
-from isac_rt.storage import BAD_DATA, check_unfolded, read_whole, write_whole
+from isac_rt.storage import BAD_DATA, StorageError, check_unfolded, read_whole, write_whole
 
 if TYPE_CHECKING:
     import xarray as xr
 
 FILE = "results.nc"
+ROOM_BYTES = 50_000_000
+"""Free on the disk before a run: a short one writes 10 MB, and keeps as much while it runs."""
 
 
 class ResultsError(UserError):
@@ -110,10 +113,22 @@ def save(results: Results, folder: str | Path) -> None:
 
 
 def check_folder(folder: str | Path) -> None:
-    """Refuse a folder that cannot be made or written, before a long run rather than after it."""
+    """Refuse a folder that cannot be made or written, or has little room, before a long run rather
+    than after it.
+
+    Raises
+    ------
+    isac_rt.storage.StorageError
+    """
     probe = Path(folder) / ".writable"
     write_whole(probe, "")
     probe.unlink(missing_ok=True)
+    free = shutil.disk_usage(folder).free
+    if free < ROOM_BYTES:
+        raise StorageError(
+            f"{folder}: {free / 1e6:.0f} MB are free, a run is given {ROOM_BYTES / 1e6:.0f} MB at "
+            "least; choose another place with --out, or make room"
+        )
 
 
 def open_results(folder: str | Path) -> Results:

@@ -9,18 +9,25 @@ never kept.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
+import itertools
+import os
 import sqlite3
 import time
 import warnings
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from isac_rt.document import ScenarioWarning
 from isac_rt.runtime import UserError, shortly
-from isac_rt.storage import BAD_DATA, checksum, pack, unpack
+from isac_rt.scenario.file import to_yaml
+from isac_rt.storage import BAD_DATA, checksum, pack, read_whole, unpack
+
+if TYPE_CHECKING:
+    from isac_rt.scenario.tree import Scenario
 
 FILE = "resume.sqlite"
 EARLIER = "unfinished.frames"
@@ -35,6 +42,62 @@ EVERY = 5.0
 
 class ResumeError(UserError):
     """The file is of another run, or holds what no run of this package wrote."""
+
+
+@contextmanager
+def sole_use(folder: Path) -> Iterator[None]:
+    """Hold a folder of results for one run.
+
+    Raises
+    ------
+    ResumeError  If another run holds it.
+    """
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise _in_use(folder) from None
+        except OSError:  # not every file system locks
+            pass
+        yield
+    finally:
+        os.close(opened)
+
+
+def check_replaces_nothing(folder: Path, scenario: Scenario) -> None:
+    """Refuse a folder that holds the whole results of another scenario.
+
+    Raises
+    ------
+    ResumeError
+    """
+    if not (folder / "summary.json").exists():
+        return
+    try:
+        earlier = read_whole(folder / "scenario.yaml").decode().splitlines()
+    except (OSError, ValueError):
+        earlier = []
+    pairs = itertools.zip_longest(earlier, to_yaml(scenario, folder).splitlines(), fillvalue="")
+    changed = [(there.strip(), now.strip()) for there, now in pairs if there != now]
+    if changed:
+        there, now = changed[0]
+        raise ResumeError(
+            f"{folder} holds the results of another scenario (there {there[:60]!r}, now "
+            f"{now[:60]!r}); give another folder with --out, or --overwrite to replace them"
+        )
+
+
+def _in_use(place: Path) -> ResumeError:
+    return ResumeError(
+        f"{place} is in use by another run; wait for its end or give another folder with --out"
+    )
+
+
+def _is_locked(problem: BaseException) -> bool:
+    """Whether another process has a database open for writing."""
+    code = getattr(problem, "sqlite_errorcode", None)
+    return code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
 
 
 class Resume:
@@ -95,6 +158,8 @@ class Resume:
         try:
             yield
         except (sqlite3.Error, *BAD_DATA) as problem:
+            if _is_locked(problem):
+                raise _in_use(self.file) from None
             raise ResumeError(
                 f"{self.file} is damaged or was not written by isac-rt "
                 f"({type(problem).__name__}: {shortly(problem)}); --restart lets go of it"
@@ -153,7 +218,9 @@ class Resume:
                     return None  # a view might never end
                 ((digest,),) = database.execute("SELECT digest FROM run").fetchmany(2)
                 return digest
-        except (sqlite3.Error, ValueError):
+        except (sqlite3.Error, ValueError) as problem:
+            if _is_locked(problem):
+                raise _in_use(self.file) from None
             return None
 
     @contextmanager

@@ -26,6 +26,7 @@ from isac_rt.cli.cli import main
 from isac_rt.document import ScenarioWarning
 from isac_rt.frame.level import LinkBudget
 from isac_rt.scenario.file import to_yaml
+from isac_rt.simulation.resume import sole_use
 from isac_rt.simulation.setup import swarm_of
 
 ROOT = Path(__file__).parents[2]
@@ -160,6 +161,43 @@ def test_run_writes_everything(scenario_file, simulation, tmp_path, capsys):
     said = capsys.readouterr()
     assert "AT to PT1" in said.out and "line of sight" in said.out and "report.html" in said.out
     assert "Traceback" not in said.err
+
+
+def test_results_of_another_scenario_are_replaced_only_when_asked(
+    scenario_file, simulation, tmp_path, monkeypatch, capsys
+):
+    """The same scenario may be run again. Planted bug: only seeds compared."""
+    monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
+    out = tmp_path / "out"
+    command = ["run", str(scenario_file), "--out", str(out)]
+    assert main(command) == 0
+    assert main(command) == 0
+    before = {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()}
+    for change in (["--seed", "42"], ["--frames", "5"], ["--set", "noise.tx_power_dbm=3"]):
+        capsys.readouterr()
+        assert main([*command, *change]) == 2
+        said = capsys.readouterr().err
+        assert "holds the results of another scenario" in said and "--overwrite" in said
+        assert said.count("\n") == 1
+    assert {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()} == before
+    assert main([*command, "--seed", "42", "--overwrite"]) == 0
+    assert json.loads((out / "summary.json").read_text())["seed"] == 42
+
+
+def test_a_folder_is_of_one_run_at_a_time(scenario_file, simulation, tmp_path, capsys):
+    """From before it is looked at. Planted bug: held while results are written only."""
+    out = tmp_path / "out"
+    out.mkdir()
+    with sole_use(out):
+        assert main(["run", str(scenario_file), "--out", str(out)]) == 2
+    assert re.fullmatch(r".* is in use by another run; .*--out\n", capsys.readouterr().err)
+    assert main(["run", str(scenario_file), "--out", str(out)]) == 0
+
+
+def test_room_is_asked_for_before_a_run(scenario_file, simulation, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("isac_rt.results.files.ROOM_BYTES", 10**18)
+    assert main(["run", str(scenario_file), "--out", str(tmp_path / "out")]) == 2
+    assert "MB are free" in capsys.readouterr().err
 
 
 def test_demo_needs_no_file(simulation, tmp_path, monkeypatch, capsys):

@@ -460,6 +460,16 @@ def test_what_could_not_be_kept_is_tried_again_after_twice_the_time(tmp_path, mo
         assert resume.due()
 
 
+def test_frames_that_another_run_keeps_just_now_are_in_use(tmp_path):
+    """Planted bug: taken for damaged, which --restart would take away."""
+    resume = kept(tmp_path, "one")
+    with closing(sqlite3.connect(resume.file)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(ResumeError, match="in use by another run") as told:
+            resume.check()
+    assert "--restart" not in str(told.value)
+
+
 def test_a_schema_from_elsewhere_is_not_trusted(tmp_path):
     """What a stranger's file has in its schema may not run functions. Planted bug: the pragma left
     out."""
@@ -501,7 +511,8 @@ def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsy
     assert "going on after the frames" in capsys.readouterr().err
     assert not (tmp_path / "out" / FILE).exists() and (tmp_path / "out" / "results.nc").exists()
     Resume(tmp_path / "out", "another").append(1)
-    assert main([*other, "--restart"]) == 0
+    assert main([*other, "--restart"]) == 2
+    assert main([*other, "--restart", "--overwrite"]) == 0
     assert open_results(tmp_path / "out").summary["seed"] == 77
 
 
@@ -547,6 +558,7 @@ def test_a_run_on_a_full_disk_goes_on_once_there_is_room(tmp_path, small_disk, m
     monkeypatch.setattr(Resume.__init__, "__defaults__", (0.0,))
     monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
     monkeypatch.setattr("isac_rt.views.report.write_report", lambda *_: None)
+    monkeypatch.setattr("isac_rt.results.files.ROOM_BYTES", 0)
     disk = small_disk(64)
     out = disk / "out"
     command = ["run", str(tmp_path / "scene.yaml"), "--out", str(out)]
