@@ -43,13 +43,13 @@ def run(
             help="Afterwards measure what was left out on sampled frames; into summary.json.",
         ),
     ] = False,
+    restart: Annotated[
+        bool,
+        typer.Option("--restart", help="Let go of frames that a stopped run kept in DIR."),
+    ] = False,
     overwrite: Annotated[
         bool,
-        typer.Option(
-            "--overwrite",
-            "--restart",
-            help="Replace what DIR holds: results of another scenario, frames of a stopped run.",
-        ),
+        typer.Option("--overwrite", help="Replace the results of another scenario in DIR."),
     ] = False,
     overrides: Overrides = None,
 ) -> None:
@@ -66,7 +66,7 @@ def run(
     with sole_use(folder), ending_soon_after_interrupt(folder):
         if not overwrite:
             check_replaces_nothing(folder, loaded)
-        _run(loaded, folder, snapshots, check_budget, overwrite)
+        _run(loaded, folder, snapshots, check_budget, restart)
     say(f"results in {folder}: report.html, results.nc, summary.json, scenario.yaml, figures/")
 
 

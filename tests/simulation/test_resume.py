@@ -511,7 +511,8 @@ def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsy
     assert "going on after the frames" in capsys.readouterr().err
     assert not (tmp_path / "out" / FILE).exists() and (tmp_path / "out" / "results.nc").exists()
     Resume(tmp_path / "out", "another").append(1)
-    assert main([*other, "--restart"]) == 0
+    assert main([*other, "--restart"]) == 2
+    assert main([*other, "--restart", "--overwrite"]) == 0
     assert open_results(tmp_path / "out").summary["seed"] == 77
 
 
