@@ -166,7 +166,7 @@ def parameters(function: ast.FunctionDef) -> int:
 
 
 def test_parameter_lists_are_short():
-    """Eight, and twelve of what is compiled, of its twin, and of commands. Planted bug: one more for
+    """Eight; twelve of what is compiled, of its twin, and of commands. Planted bug: one more for
     `if_signal`, which has five; one more for the gridded kernel, which has twelve."""
     long = {}
     for path in MODULES:
