@@ -12,6 +12,8 @@ SHELL := /bin/bash
 
 BIN := .venv/bin
 STAMP := .venv/.setup-done
+# a new environment is made here, and takes the old one's place when it is whole
+NEW := .venv.new
 
 # The lock's own tools; kept out of the virtual environment of the project.
 LOCK_TOOL := .cache/lock
@@ -36,10 +38,12 @@ $(STAMP): requirements.lock pyproject.toml
 	    echo "setup: $$python cannot make virtual environments; install its venv package: apt install $$package" >&2; exit 1; }; \
 	fi; \
 	$$python -c 'import sys; print("setup: Python %d.%d.%d, installing the locked packages into .venv (minutes the first time)" % sys.version_info[:3])'; \
-	$$python -m venv --clear .venv
+	$$python -m venv --clear $(NEW)
 	@n=0; ( while sleep 10; do n=$$((n + 10)); echo "setup: still installing, $$n s"; done ) & beat=$$!; trap "kill $$beat" EXIT; \
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --only-binary :all: -r requirements.lock
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --no-index --editable .
+	$(NEW)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --only-binary :all: -r requirements.lock
+	@$(NEW)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --no-index --editable .
+	@grep -rIlF "$(CURDIR)/$(NEW)" $(NEW)/bin | xargs sed -i "s|$(CURDIR)/$(NEW)|$(CURDIR)/.venv|g"
+	@rm -rf .venv.old; if [ -e .venv ]; then mv .venv .venv.old; fi; mv $(NEW) .venv; rm -rf .venv.old
 	@touch $@
 
 # Dr.Jit needs an NVIDIA GPU or a libLLVM of the right version: ask the program (in isolated mode: nothing else is loaded),
@@ -93,5 +97,5 @@ lock:
 	  --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" pyproject.toml --output-file requirements.lock
 
 clean:
-	rm -rf .venv .cache .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv $(NEW) .cache .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find isac_rt reproduce benchmarks tests -name __pycache__ -type d -prune -exec rm -rf {} +
