@@ -17,8 +17,9 @@ from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import OWN, Scenario
 from isac_rt.settings import plain_tree
 from isac_rt.sweep.definition import Point, files_under, ground_by, paths_key, point_key
-from isac_rt.sweep.execute import Job, SweepError, connected, run_points
+from isac_rt.sweep.execute import Job, connected, run_points
 from isac_rt.sweep.outcomes import Outcomes, pending
+from isac_rt.sweep.workers import SweepError
 from reproduce import SCENES
 from reproduce.outcome import Progress
 

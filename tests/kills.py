@@ -2,7 +2,7 @@
 
     python tests/kills.py --runs 140 --sweeps 60 --full 20 --seed 1
 
-Runs (figures included), clients, workers and schedulers of sweeps are killed (SIGKILL, SIGTERM,
+Runs (figures included), clients and workers of sweeps are killed (SIGKILL, SIGTERM,
 SIGINT, SIGHUP) at random moments, or write on a file system that is full at a random size, as root.
 What is left goes on by the same command. In the end the bits are those of an undisturbed run, no
 finished point was touched, and no temporary file is left. All processes are forks of this one, so
@@ -12,7 +12,6 @@ that a trial takes seconds.
 from __future__ import annotations
 
 import argparse
-import asyncio
 import collections
 import os
 import random
@@ -73,37 +72,22 @@ def command(*arguments: str) -> int:
     return main(list(arguments))
 
 
-def scheduler(port: int) -> None:
-    from distributed import Scheduler
-
-    async def serve() -> None:
-        async with Scheduler(host="127.0.0.1", port=port, dashboard=False) as made:
-            await made.finished()
-
-    asyncio.run(serve())
-
-
-def worker(port: int) -> None:
-    from distributed import Worker
-
-    async def serve() -> None:
-        async with Worker(f"tcp://127.0.0.1:{port}", nthreads=1, death_timeout=60) as made:
-            await made.finished()
-
-    asyncio.run(serve())
+def children(pid: int) -> list[int]:
+    """Workers of a client."""
+    found = Path(f"/proc/{pid}/task/{pid}/children")
+    return [int(word) for word in found.read_text().split()] if found.exists() else []
 
 
 def warm_up(folder: Path) -> None:
     """Load and compile here what all forks need, and have them draw two figures instead of all."""
-    for module in ("distributed", "isac_rt.sweep"):
-        import_module(module)
+    import_module("isac_rt.sweep")
     from isac_rt.results.files import save
     from isac_rt.scenario.file import load
     from isac_rt.simulation import simulate
     from isac_rt.views import figures
     from isac_rt.views.report import write_report
 
-    def two(dataset, _):
+    def two(dataset, *_):
         for name in ("one", "two"):
             yield figures.Drawing(name, [partial(figures.reference_snr, dataset=dataset)], 2.7)
 
@@ -146,7 +130,7 @@ class Trials:
     """The undisturbed results, and one trial after the other."""
 
     def __init__(self, folder: Path, seed: int) -> None:
-        self.folder, self.rng, self.port = folder, random.Random(seed), 18800
+        self.folder, self.rng = folder, random.Random(seed)
         self.log = folder / "log"
         (folder / "base.yaml").write_text(SCENE)
         (folder / "sweep.yaml").write_text(SWEEP)
@@ -166,33 +150,11 @@ class Trials:
         return ended(self.start_single(out))
 
     def start_client(self, out: Path) -> int:
-        file, address = str(self.folder / "sweep.yaml"), f"tcp://127.0.0.1:{self.port}"
-        return forked(
-            lambda: command("sweep", file, "--out", str(out), "--scheduler", address), self.log
-        )
-
-    def start_cluster(self) -> dict[str, int]:
-        self.port += 1
-        port = self.port
-        found = {"scheduler": forked(lambda: scheduler(port), Path(os.devnull))}
-        return found | {
-            name: forked(lambda: worker(port), Path(os.devnull)) for name in ("worker", "another")
-        }
-
-    def end_cluster(self, cluster: dict[str, int]) -> None:
-        for pid in cluster.values():
-            try:
-                os.kill(pid, signal.SIGKILL)
-                os.waitpid(pid, 0)
-            except (ProcessLookupError, ChildProcessError):
-                pass
+        file = str(self.folder / "sweep.yaml")
+        return forked(lambda: command("sweep", file, "--out", str(out), "--workers", "2"), self.log)
 
     def swept(self, out: Path) -> int:
-        cluster = self.start_cluster()
-        try:
-            return ended(self.start_client(out))
-        finally:
-            self.end_cluster(cluster)
+        return ended(self.start_client(out))
 
     def killed_run(self, out: Path) -> str:
         for _ in range(self.rng.choice([1, 1, 2, 3])):
@@ -210,18 +172,17 @@ class Trials:
         return f"run {signal.Signals(how).name}"
 
     def killed_sweep(self, out: Path) -> str:
-        victim = self.rng.choice(["client", "worker", "scheduler"])
-        cluster = self.start_cluster()
-        client = self.start_client(out)
+        victim, client = self.rng.choice(["client", "worker"]), self.start_client(out)
         time.sleep(self.rng.uniform(0.0, 1.05 * self.sweep_s))
+        workers = children(client)
         try:
-            os.kill(client if victim == "client" else cluster[victim], signal.SIGKILL)
+            one = self.rng.choice(workers) if victim == "worker" and workers else client
+            os.kill(one, signal.SIGKILL)
         except ProcessLookupError:
             pass
-        before = stamps(out) if victim != "worker" else {}
+        before = stamps(out)
         status = ended(client)
-        assert status in {"client": (0, -9), "worker": (0,), "scheduler": (0, 1, 2)}[victim], status
-        self.end_cluster(cluster)
+        assert status in (0, -9), status
         assert self.swept(out) == 0
         assert stamps(out).items() >= before.items(), "done twice"
         assert sweep_digest(out) == self.sweep and not left_over(out / "points"), left_over(out)

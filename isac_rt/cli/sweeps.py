@@ -58,7 +58,7 @@ def sweep(
     folder = out if out is not None else Path("runs") / plan.sweep.name
     check_folder(folder)
     with ending_soon_after_interrupt(folder):
-        _on_dask(
+        _on_workers(
             "points",
             partial(
                 run_sweep,
@@ -72,7 +72,7 @@ def sweep(
         _finish(plan, folder)
 
 
-def _on_dask(what: str, run: Callable[..., Any]) -> Any:
+def _on_workers(what: str, run: Callable[..., Any]) -> Any:
     """Run points with a bar; a scheduler that is lost on the way is one message, exit 1."""
     from isac_rt.sweep import SchedulerLost
 
@@ -132,7 +132,7 @@ def dataset(
     folder = out if out is not None else Path("runs") / plan.data.name
     check_folder(folder)
     with ending_soon_after_interrupt(folder):
-        card = _on_dask(
+        card = _on_workers(
             "scenes", partial(run_dataset, plan, folder, workers=workers, scheduler=scheduler)
         )
     counts = {name: (len(shards), sum(shards.values())) for name, shards in card["splits"].items()}

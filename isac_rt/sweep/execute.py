@@ -1,50 +1,58 @@
-"""Running the points of a sweep on Dask: an embedded cluster, or a scheduler that is already there.
+"""Runs the points of a sweep on workers.
 
-The scheduler sees a window of small tasks and gets back a few words for each; outcomes go straight
-from the worker to the disk. So neither client nor scheduler grows with the sweep, and whoever is
-killed takes nothing with it that was finished.
+Workers get small jobs and send back a few words; outcomes go straight from the worker to the disk.
+So the client does not grow with the sweep, and whoever is killed takes nothing with it that was
+finished.
 """
 
 from __future__ import annotations
 
 import json
-import logging
 import math
 import os
 import platform
 import shutil
+import sys
 import time
 import traceback
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from isac_rt.runtime import MachineProblem, UserError, available_memory, of_machine
+from isac_rt.runtime import MachineProblem, available_memory, of_machine
 from isac_rt.sweep.definition import Plan, Point, Points, ground_of
 from isac_rt.sweep.outcomes import Outcomes, pending
+from isac_rt.sweep.workers import (
+    LEFT,
+    LOST,
+    LOST_AFTER,
+    Ended,
+    Processes,
+    SchedulerLost,
+    Workers,
+    cluster_at,
+    lost_often,
+)
 
 if TYPE_CHECKING:
     from isac_rt.propagation.store import PathStore
     from isac_rt.scenario.tree import Scenario
     from isac_rt.simulation.setup import Setup
 
-WINDOW = 4
-"""Tasks that the scheduler is given ahead, for each thread of a worker."""
 WORKER_BYTES = 1.5e9
 """Memory that a worker is reckoned with when their number is chosen: a ray-traced city, three
 receivers at work."""
-LOST_AFTER = 5
-"""Workers that a point may take with it before it is left to do."""
-PATIENCE = 2
-"""Windows of points in a row that the machine did not let end: then the sweep stops."""
+PATIENCE = 16
+"""Points in a row that the machine did not let end, before the sweep stops; on a cluster twice as
+many as it is given at once."""
+FOLLOWERS = 512
+"""Points that may wait for others whose paths they share."""
 ROOM = 1_000_000
 """Free disk without which no point is begun. [bytes]"""
-CONNECT_S = 5
 CACHE_BYTES = 4 * 1024**3
 
 KEPT = ("links", "terminals", "swarm", "compared", "paths", "fidelity", "timing_s", "versions")
@@ -56,16 +64,8 @@ Progress = Callable[[int, int, int], None]
 """Called with points done, failed, and in all."""
 
 
-class SweepError(UserError):
-    """The sweep cannot start. The text says what to do."""
-
-
 class PointsLeft(MachineProblem):
     """The machine did not let some points end; what was finished is kept. The text says why."""
-
-
-class SchedulerLost(Exception):
-    """The sweep cannot go on; what was finished is kept."""
 
 
 @dataclass(frozen=True)
@@ -109,21 +109,13 @@ class Job:
         return simulate.summarise(scenario, setup=setup, threads=self.threads)
 
 
-class Ended(NamedTuple):
-    """What came of a point at a worker: its outcome's status, or "left" and why."""
-
-    status: str
-    why: str = ""
-    worker: str = ""
-
-
 def run_job(job: Job) -> Ended:
     """Simulate a point and write its outcome; in a worker.
 
     Only an error that the point's own content causes is an outcome. Where the machine is to blame
     (its disk, its memory, a folder that it does not see) nothing is recorded, and the point is left
-    to do. Dask repeats a task whose worker dies before its word reached the client; a point whose
-    outcome is there is not repeated.
+    to do. A job whose worker dies before it has answered is repeated; a point whose outcome is
+    there is not.
     """
     outcomes = job.outcomes
     try:
@@ -135,7 +127,7 @@ def run_job(job: Job) -> Ended:
     except Exception as problem:
         if not of_machine(problem):
             raise
-        return Ended("left", f"{platform.node()}: {_words(problem)}", _address())
+        return Ended(LEFT, f"{platform.node()}: {_words(problem)}", _address())
     return Ended(outcome["status"])
 
 
@@ -182,7 +174,9 @@ def _words(problem: BaseException) -> str:
 
 
 def _address() -> str:
-    """Of this worker; "" outside of a cluster."""
+    """Address of this worker in a cluster; "" elsewhere."""
+    if "distributed" not in sys.modules:
+        return ""
     from distributed import get_worker
 
     try:
@@ -210,64 +204,17 @@ def default_workers() -> int:
 
 
 @contextmanager
-def _silent(*names: str) -> Iterator[None]:
-    """Without what some loggers say short of a crash: a lost scheduler is one message of ours, and
-    none of theirs with a traceback. Dask sets their levels when it is loaded."""
-    loggers = [logging.getLogger(name) for name in names]
-    before = [logger.level for logger in loggers]
+def connected(workers: int | None, scheduler: str | None) -> Iterator[Workers]:
+    """Workers of our own, or those of the scheduler at an address."""
+    if scheduler is not None:
+        with cluster_at(scheduler, run_job) as cluster:
+            yield cluster
+        return
+    processes = Processes(workers or default_workers(), run_job)
     try:
-        for logger in loggers:
-            logger.setLevel(logging.CRITICAL)
-        yield
+        yield processes
     finally:
-        for logger, level in zip(loggers, before, strict=True):
-            logger.setLevel(level)
-
-
-@contextmanager
-def connected(workers: int | None, scheduler: str | None) -> Iterator[Any]:
-    """A client of the scheduler at an address, or of a cluster of our own with one thread a
-    worker."""
-    import dask
-    from distributed import Client, LocalCluster
-
-    quiet = {
-        "distributed.scheduler.allowed-failures": LOST_AFTER,
-        "distributed.worker.daemon": True,
-        "distributed.comm.timeouts.connect": f"{CONNECT_S}s",
-    }
-    with dask.config.set(quiet), _silent("distributed", "distributed.client"):
-        if scheduler is not None:
-            try:
-                client = Client(scheduler, timeout=CONNECT_S)
-            except (OSError, TimeoutError, ValueError) as problem:
-                said = (
-                    f"no scheduler answers at {scheduler}: {problem}; start one with `dask "
-                    "scheduler`, or leave --scheduler out"
-                )
-                raise SweepError(said) from problem
-            try:
-                yield client
-            finally:
-                with suppress(Exception):
-                    client.close(timeout=2)
-            return
-        cluster = LocalCluster(
-            n_workers=workers or default_workers(),
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address=None,
-            silence_logs=50,
-        )
-        number = len(cluster.workers)
-        cluster.adapt(minimum=number, maximum=number)  # one that could not start again is replaced
-        client = Client(cluster)
-        try:
-            yield client
-        finally:
-            with suppress(Exception):
-                client.close(timeout=2)
-                cluster.close(timeout=5)
+        processes.close()
 
 
 def run_sweep(
@@ -285,8 +232,8 @@ def run_sweep(
     ----------
     plan : from `load_sweep`
     folder : of the outcomes; on a cluster one that every worker reaches under this path
-    workers : processes of the embedded cluster; None: `default_workers`
-    scheduler : address of a Dask scheduler to use instead, such as tcp://10.0.0.1:8786
+    workers : processes on this machine; None: `default_workers`
+    scheduler : address of a Dask scheduler to use instead, such as tls://10.0.0.1:8786
     retry_failed : run points again that failed before
     progress : called after every point
 
@@ -332,14 +279,14 @@ def _job(point: Point, **fields: Any) -> Job:
 def run_points(
     plan: Points,
     outcomes: Outcomes,
-    client: Any,
+    workers: Workers,
     job: Callable[..., Job],
     missing: Iterator[Point],
     done: int,
     retry_failed: bool = False,
     progress: Progress | None = None,
 ) -> None:
-    """Run what is missing among points at a client's workers.
+    """Run what is missing among points.
 
     Parameters
     ----------
@@ -351,46 +298,39 @@ def run_points(
     ------
     PointsLeft, SchedulerLost  As `run_sweep`.
     """
-    _Runner(plan, outcomes, client, job, done, retry_failed, progress).run(missing)
+    _Runner(plan, outcomes, workers, job, done, retry_failed, progress).run(missing)
 
 
 class _Runner:
-    """Feeds the scheduler from a window and counts what comes back.
+    """Keeps workers busy and counts what comes back.
 
     Of the points that share their paths one goes first; the others follow when its paths are on the
-    disk. Points that the machine did not let end are tried again when the others are done, rather
-    at workers that had no such trouble.
+    disk. Points that the machine did not let end are tried again when the others are done.
     """
 
     def __init__(
         self,
         plan: Points,
         outcomes: Outcomes,
-        client: Any,
+        workers: Workers,
         job: Callable[..., Job],
         done: int,
         retry_failed: bool,
         progress: Progress | None,
     ) -> None:
-        self._job = job
-        self._retry_failed = retry_failed
-        self._plan, self._outcomes, self._client, self._progress = plan, outcomes, client, progress
+        self._plan, self._outcomes, self._workers, self._job = plan, outcomes, workers, job
+        self._retry_failed, self._progress = retry_failed, progress
         self._done, self._failed = done, 0
-        threads = sum(client.nthreads().values()) or 1
-        here = os.cpu_count() or 1
-        self._threads = max(1, here // max(len(client.nthreads()), 1))
-        self._window = WINDOW * max(threads, 2)
+        self._ready: deque[Point] = deque()
         self._leading: dict[str, deque[Point]] = {}
         self._traced: set[str] = set()
-        self._waiting = 0
         self._active: dict[str, Point] = {}
+        self._deaths: Counter[str] = Counter()
         self._left: dict[str, tuple[Point, str]] = {}
         self._in_a_row = 0
-        self._troubled: set[str] = set()
-        self._numbers = count()
 
     def run(self, missing: Iterator[Point]) -> None:
-        """Until every missing point is done, failed or left."""
+        """Run until every missing point is done, failed or left."""
         self._pass(missing)
         if self._left and not self._stuck:
             again, self._left, self._in_a_row = self._left, {}, 0
@@ -405,52 +345,47 @@ class _Runner:
 
     @property
     def _stuck(self) -> bool:
-        return self._in_a_row >= PATIENCE * self._window
+        return self._in_a_row >= max(PATIENCE, 2 * self._workers.capacity)
 
     def _pass(self, points: Iterator[Point]) -> None:
-        from distributed import CancelledError, as_completed
+        self._fill(points)
+        while self._active:
+            try:
+                key, ended = self._workers.ended()
+            except SchedulerLost as problem:
+                raise SchedulerLost(
+                    f"the scheduler was lost ({problem}); {self._done} of "
+                    f"{self._plan.num_points} points are done and kept: start the same command "
+                    "again to go on"
+                ) from problem
+            self._finish(key, ended)
+            self._fill(points)
 
-        queue = as_completed([])
-        self._fill(points, queue)
-        try:
-            for future in queue:
-                self._finish(future, queue)
-                self._fill(points, queue)
-        except (CancelledError, OSError) as problem:
-            raise self._lost(problem) from problem
-        if self._active:
-            raise self._lost(None)
-
-    def _lost(self, problem: BaseException | None) -> SchedulerLost:
-        why = f" ({problem})" if problem is not None and str(problem) else ""
-        return SchedulerLost(
-            f"the scheduler was lost{why}; {self._done} of {self._plan.num_points} points "
-            "are done and kept: "
-            "start the same command again to go on"
-        )
-
-    def _fill(self, points: Iterator[Point], queue: Any) -> None:
-        """Give the scheduler points up to the window; followers of a running leader wait, at most a
-        window of them."""
-        while (
-            len(self._active) < self._window
-            and self._waiting < 64 * self._window
-            and not self._stuck
-        ):
-            point = next(points, None)
+    def _fill(self, points: Iterator[Point]) -> None:
+        """Give the workers as many points as they take; followers of a leader at work wait."""
+        while len(self._active) < self._workers.capacity and not self._stuck:
+            point = self._ready.popleft() if self._ready else self._next(points)
             if point is None:
                 return
+            self._give(point)
+
+    def _next(self, points: Iterator[Point]) -> Point | None:
+        """The next point that need not wait; None where all that are left do."""
+        while sum(map(len, self._leading.values())) < FOLLOWERS:
+            point = next(points, None)
+            if point is None:
+                return None
             if point.key in self._active:
                 continue  # the same scenario twice in one sweep
-            if point.paths_key is not None and point.paths_key not in self._traced:
-                if point.paths_key in self._leading:
-                    self._leading[point.paths_key].append(point)
-                    self._waiting += 1
-                    continue
+            if point.paths_key is None or point.paths_key in self._traced:
+                return point
+            if point.paths_key not in self._leading:
                 self._leading[point.paths_key] = deque()
-            self._submit(point, queue)
+                return point
+            self._leading[point.paths_key].append(point)
+        return None
 
-    def _submit(self, point: Point, queue: Any) -> None:
+    def _give(self, point: Point) -> None:
         job = self._job(
             point,
             key=point.key,
@@ -458,32 +393,23 @@ class _Runner:
             ground=point.ground,
             scenario_folder=str(self._plan.base.folder),
             folder=str(self._outcomes.folder),
-            threads=self._threads,
+            threads=max(1, (os.cpu_count() or 1) // self._workers.number),
             retry_failed=self._retry_failed,
         )
         self._active[point.key] = point
-        good = self._troubled and [w for w in self._client.nthreads() if w not in self._troubled]
-        rather = {"workers": good, "allow_other_workers": True} if good else {}
-        task = f"point-{point.key}-{next(self._numbers)}"  # never one that may be forgotten
-        queue.add(self._client.submit(run_job, job, key=task, pure=False, **rather))
+        self._workers.give(point.key, job)
 
-    def _finish(self, future: Any, queue: Any) -> None:
-        from distributed import CancelledError
-
-        if future.cancelled():
-            raise CancelledError("its tasks are gone")
-        key = future.key.split("-")[1]
+    def _finish(self, key: str, ended: Ended) -> None:
         point = self._active.pop(key)
-        if future.status == "lost":  # its worker died before its word was heard
-            future.release()
-            self._submit(point, queue)
-            return
-        ended = Ended("left", _of_worker(future)) if future.status == "error" else future.result()
-        future.release()
-        if ended.status == "left":
+        if ended.status == LOST:
+            self._deaths[key] += 1
+            if self._deaths[key] < LOST_AFTER:
+                self._give(point)
+                return
+            ended = Ended(LEFT, lost_often())
+        if ended.status == LEFT:
             self._left[key] = point, ended.why
             self._in_a_row += 1
-            self._troubled |= {ended.worker} - {""}
         else:
             self._in_a_row = 0
             self._done += ended.status == "done"
@@ -492,14 +418,4 @@ class _Runner:
             self._progress(self._done, self._failed, self._plan.num_points)
         if point.paths_key is not None:
             self._traced.add(point.paths_key)
-            for follower in self._leading.pop(point.paths_key, ()):
-                self._waiting -= 1
-                self._submit(follower, queue)
-
-
-def _of_worker(future: Any) -> str:
-    """What took a worker's task down."""
-    problem = future.exception()
-    if type(problem).__name__ == "KilledWorker":
-        return f"{LOST_AFTER} workers in turn died while they ran it (out of memory?)"
-    return _words(problem)
+            self._ready.extend(self._leading.pop(point.paths_key, ()))

@@ -13,8 +13,9 @@ from scipy import stats
 
 from isac_rt.cli.cli import main
 from isac_rt.results.metrics import binomial_interval
-from isac_rt.sweep.execute import SweepError, run_job, run_points
+from isac_rt.sweep.execute import run_job, run_points
 from isac_rt.sweep.outcomes import Outcomes
+from isac_rt.sweep.workers import SweepError
 from reproduce import city, city_flights
 from reproduce.city import Estimate, Goal, mean, rate, root
 from reproduce.city_flights import (

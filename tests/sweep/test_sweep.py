@@ -7,6 +7,7 @@ import json
 import os
 import random
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -566,71 +567,84 @@ def test_interrupt_ends_soon_and_keeps_what_is_finished(folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("trial", range(8))
 def test_whoever_is_killed_at_a_random_moment(folder, trial):
-    """A scheduler and two workers as separate processes; one of them or the client is killed at a
-    random moment, whatever it was is started again, and in the end the dataset is that of an
-    undisturbed run."""
+    """One of two workers, or the client, is killed at a random moment; the client is started again,
+    and in the end the dataset is that of an undisturbed run."""
     rng = random.Random(trial)
     plan, out = plan_of(folder, LONGER), folder / "out"
-    address = f"tcp://127.0.0.1:{8800 + trial}"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
-
-    def scheduler():
-        return subprocess.Popen(
-            [sys.executable, "-m", "dask", "scheduler", "--port", address[-4:], "--no-dashboard"],
-            **quiet,
-        )
-
-    def worker():
-        return subprocess.Popen(
-            [sys.executable, "-m", "dask", "worker", address, "--nthreads", "1", "--no-dashboard"],
-            **quiet,
-        )
-
-    running = {"scheduler": scheduler(), "one": worker(), "two": worker()}
-    try:
-        client = start_client(folder, out, "--scheduler", address)
-        wait_for_points(client, out, 1 + rng.randrange(20))
-        victim = rng.choice(["scheduler", "one", "client"])
-        target = client if victim == "client" else running[victim]
-        target.send_signal(signal.SIGKILL)
-        done_before = {f: f.stat().st_mtime_ns for f in (out / "points").rglob("*.json")}
-        if victim == "one":
-            assert client.wait(timeout=480) == 0
-        else:
-            code = client.wait(timeout=480)
-            assert code != 0
-            if victim == "scheduler":
-                assert code == 1 and "start the same command again" in client.stderr.read()
-                running["scheduler"] = scheduler()
-                running |= {"one": worker(), "two": worker()}
-            again = start_client(folder, out, "--scheduler", address)
-            assert again.wait(timeout=480) == 0, again.stderr.read()
-        assert all(f.stat().st_mtime_ns == stamp for f, stamp in done_before.items())
-    finally:
-        for process in running.values():
-            process.kill()
+    client = start_client(folder, out, "--workers", "2")
+    wait_for_points(client, out, 1 + rng.randrange(20))
+    workers = psutil.Process(client.pid).children(recursive=True)
+    victim = rng.choice([*workers, client])
+    victim.send_signal(signal.SIGKILL)
+    before = {f: f.stat().st_mtime_ns for f in (out / "points").rglob("*.json")}
+    if victim is client:
+        assert client.wait(timeout=480) != 0
+        again = start_client(folder, out, "--workers", "2")
+        assert again.wait(timeout=480) == 0, again.stderr.read()
+    else:
+        assert client.wait(timeout=480) == 0, client.stderr.read()
+    assert all(f.stat().st_mtime_ns == stamp for f, stamp in before.items())
     run_here(plan, folder / "calm")
     Outcomes(folder / "calm").save_definition(plan)
     same(open_sweep(out), open_sweep(folder / "calm"))
 
 
-def test_no_scheduler_at_the_address(folder, capsys):
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("tcp://127.0.0.1:1", "without TLS lets everybody who reaches it run code as you"),
+        ("127.0.0.1:8786", "write tls://HOST:PORT"),
+        ("tls://127.0.0.1:1", "no scheduler answers at tls://127.0.0.1:1"),
+    ],
+)
+def test_a_scheduler_without_tls_or_that_is_not_there(folder, capsys, address, said):
+    """Planted bug: a tcp address connected to."""
     plan_of(folder)
-    assert (
-        main(
-            [
-                "sweep",
-                str(folder / "sweep.yaml"),
-                "--out",
-                str(folder / "o"),
-                "--scheduler",
-                "tcp://127.0.0.1:1",
-            ]
-        )
-        == 2
+    command = ["sweep", str(folder / "sweep.yaml"), "--out", str(folder / "o")]
+    assert main([*command, "--scheduler", address]) == 2
+    assert said in capsys.readouterr().err
+
+
+# ---- what others can do to a sweep at work
+
+
+EVIL = "open({marker!r}, 'a').write(__name__ + chr(10))\nraise ImportError('evil')\n"
+NAMES = "multiprocessing numpy isac_rt yaml usercustomize resource encodings typing".split()
+
+
+def test_no_module_of_the_working_folder_runs_in_workers(folder):
+    """Planted bug: processes that begin without PYTHONSAFEPATH."""
+    marker, place = folder / "ran", folder / "place"
+    place.mkdir()
+    for name in NAMES:
+        (place / f"{name}.py").write_text(EVIL.format(marker=str(marker)))
+    plan_of(folder)
+    program = Path(sys.executable).with_name("isac-rt")
+    done = subprocess.run(
+        [program, "sweep", folder / "sweep.yaml", "--out", folder / "out", "--workers", "2"],
+        cwd=place,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
     )
-    assert "no scheduler answers at tcp://127.0.0.1:1" in capsys.readouterr().err
+    assert done.returncode == 0, done.stderr
+    assert not marker.exists(), marker.read_text()
+
+
+def test_nobody_else_can_connect_to_a_sweep_at_work(folder):
+    """No process of a sweep listens: neither on a port nor on a socket with a name. Planted bug:
+    the embedded Dask cluster of earlier versions."""
+    plan_of(folder, LONGER)
+    client = start_client(folder, folder / "out", "--workers", "2")
+    wait_for_points(client, folder / "out", 2)
+    processes = [(p := psutil.Process(client.pid)), *p.children(recursive=True)]
+    assert len(processes) >= 3  # the client and two workers
+    listening = []
+    for process in processes:
+        for c in process.net_connections("all"):
+            if c.status == psutil.CONN_LISTEN or (c.family == socket.AF_UNIX and c.laddr):
+                listening.append((process.name(), c))
+    assert listening == []
 
 
 # ---- shared paths
