@@ -116,7 +116,7 @@ TESTS_OF = {
     "receive/clutter/correction.py": "test_clutter_fit",
     "receive/clutter/power.py": "test_clutter_detectors",
     "receive/clutter/angle_doppler.py": "test_clutter_detectors",
-    "receive/clutter/coherent.py": "test_clutter_detectors",
+    "receive/directions.py": "test_clutter_detectors test_directions",
     "storage.py": "test_storage",
     "propagation/store.py": "test_keys test_sweep",
     "simulation/resume.py": "test_resume",

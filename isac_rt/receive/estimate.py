@@ -23,7 +23,9 @@ import numpy as np
 
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.kernels.jit import jit
+from isac_rt.kernels import receive_directions
+from isac_rt.kernels.jit import jit, twin_of
+from isac_rt.kernels.receive_directions import TIE
 from isac_rt.kernels.vector import (
     LANES,
     aligned,
@@ -52,8 +54,6 @@ _STENCIL = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1]
 """Places of a stencil down and across: its middle, the cross, the corners."""
 PULL = 1.0
 """Distance of another path in the cell [cells, bins]."""
-TIE = 1e-9
-"""Share by which a direction must be stronger: both ends of the axis may be the same one."""
 _NONE = np.float32(0)
 T = TypeVar("T", float, np.ndarray)
 
@@ -531,56 +531,39 @@ def _along(channels: np.ndarray, known: Known, axis: int, *, on_grid: bool) -> n
     # the receivers stand alike for every transmitter
     apart = known.wavenumber * line.places[: values.shape[2], axis]
     count = 8 * (a.rx_x if axis == 0 else a.rx_z) * (2 if echo else 1) + 1
-    best: np.ndarray = _all_strongest(values, apart, limit, count, not on_grid)
+    best = np.empty(len(channels))
+    fill_strongest(values, apart, limit, count, not on_grid, best)
     return np.where(np.abs(best) <= 1, best, np.nan)
 
 
-@jit
-def _all_strongest(values, apart, limit, count, fine):
-    """`_strongest` of each of `values` (Q, T, L)."""
-    out = np.empty(len(values))
-    for q in range(out.size):
-        out[q] = _strongest(values[q], apart, limit, count, fine)
-    return out
+@twin_of(receive_directions.strongest)
+def fill_strongest(
+    values: np.ndarray, apart: np.ndarray, limit: float, count: int, fine: bool, out: np.ndarray
+) -> None:
+    """Fill the direction cosines (Q,) of the most power of values (Q, T, L), in phase over elements
+    at `apart` [rad per unit cosine] and in power over T.
 
+    The first of the largest of `count` from -limit to `limit`, as both ends may be the same
+    direction; `fine` about it by parabolas through the logarithms of three powers, at steps that
+    shrink.
+    """
 
-@jit
-def _strongest(values, apart, limit, count, fine):
-    """Direction cosine of the most power, of `count` from -limit to `limit`, and `fine` about the
-    best of them by parabolas through the logarithm; `values` (T, L) of elements at `apart`
-    [rad]."""
-    step = 2 * limit / (count - 1)
-    turn, move = np.exp(-1j * limit * apart), np.exp(1j * step * apart)
-    best, most = -limit, -1.0
-    for i in range(count):
-        power = _beam(values, turn)
-        if power > most * (1 + TIE):
-            best, most = -limit + i * step, power
-        turn *= move
-    for part in (2.0, 12.0, 60.0):
-        if not fine:
-            break
+    def power(u: np.ndarray) -> np.ndarray:
+        beams = np.einsum("qtl,qgl->qtg", values, np.exp(1j * u[..., None] * apart))
+        return (np.abs(beams) ** 2).sum(axis=1)
+
+    grid = np.tile(np.linspace(-limit, limit, count), (len(values), 1))
+    most, step = power(grid), 2 * limit / (count - 1)
+    first = (most >= most.max(axis=1, keepdims=True) / (1 + TIE)).argmax(axis=1)
+    out[:] = grid[0, first]
+    for part in (2.0, 12.0, 60.0) if fine else ():
         near = step / part
-        low = np.log(max(_beam(values, np.exp(1j * (best - near) * apart)), 1e-300))
-        mid = np.log(max(_beam(values, np.exp(1j * best * apart)), 1e-300))
-        high = np.log(max(_beam(values, np.exp(1j * (best + near) * apart)), 1e-300))
+        three = power(out[:, None] + near * np.array([-1, 0, 1]))
+        low, mid, high = np.log(np.maximum(three, 1e-300)).T
         curve = low - 2 * mid + high
-        up = 0.5 * (low - high) / curve * near if curve < 0 else near * np.sign(high - low)
-        best += min(max(up, -2 * near), 2 * near)
-    return best
-
-
-@jit(borrows=True)
-def _beam(values, turn):
-    """Power of the rows of `values` (T, L), each turned by `turn` and added in phase."""
-    power = 0.0
-    for t in range(values.shape[0]):
-        re, im = 0.0, 0.0
-        for i in range(turn.size):
-            re += values[t, i].real * turn[i].real - values[t, i].imag * turn[i].imag
-            im += values[t, i].real * turn[i].imag + values[t, i].imag * turn[i].real
-        power += re * re + im * im
-    return power
+        top = 0.5 * (low - high) / np.where(curve < 0, curve, 1) * near
+        up = np.where(curve < 0, top, near * np.sign(high - low))
+        out += np.clip(up, -2 * near, 2 * near)
 
 
 def direction_cosines(estimate: Estimate, known: Known, *, on_grid: bool = False) -> list[float]:

@@ -26,8 +26,9 @@ from isac_rt.propagation.clutter.resampled import scatterer_phase
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import seed_sequence
-from isac_rt.receive.clutter.coherent import Bucketed, searches
+from isac_rt.receive.clutter.covariance import Bucketed
 from isac_rt.receive.clutter.power import TAPER, Taper, expected_power
+from isac_rt.receive.directions import searches
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.simulation.setup import propagation_in, swarm_of

@@ -18,8 +18,9 @@ from isac_rt.receive.arms import all_channels, arm, both_arms
 from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.clutter.adaptive import expected_count, scanned
 from isac_rt.receive.clutter.angle_doppler import AngleDoppler, beam_weights, near_beam, noise_level
-from isac_rt.receive.clutter.coherent import Bucketed, Search, search_plain, search_white, searches
+from isac_rt.receive.clutter.covariance import Bucketed
 from isac_rt.receive.clutter.power import Taper, expected_power
+from isac_rt.receive.directions import Search, search_plain, search_white, searches
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
@@ -161,13 +162,11 @@ def test_search_finds_the_largest_statistic_over_directions(white: bool):
     u[:, [0, 2]] = rng.uniform(-0.6, 0.6, (count, 2))
     x = draw(R, count, rng) + 3.0 * channels.steering(u, known_)
     if white:
-        maps = np.zeros((3, antennas.num_rx, 1, count), np.complex64)
-        maps[channels.tx, channels.rx, 0] = x.T
-        found = search_plain(maps, search, 1.0, 0.0)
+        found = search_plain(x.T[None].astype(np.complex64), search, 1.0, 0.0)
     else:
         same = np.broadcast_to(R, (count, size, size))
-        given = x.astype(np.complex64), same.astype(np.complex64)
-        found = search_white(*given, np.arange(count), search, 0.0)
+        given = x[:, None].astype(np.complex64), same.astype(np.complex64)
+        found, _ = search_white(*given, np.arange(count), search)
     line = np.linspace(-1, 1, 129) * antennas.view_limit
     grid = np.zeros((line.size**2, 3))
     grid[:, 0], grid[:, 2] = (g.ravel() for g in np.meshgrid(line, line))

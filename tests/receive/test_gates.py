@@ -11,8 +11,8 @@ from scipy import stats
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.clutter.angle_doppler import AngleDoppler
-from isac_rt.receive.clutter.coherent import searches
 from isac_rt.receive.clutter.gates import gates_of, seek
+from isac_rt.receive.directions import searches
 from isac_rt.receive.known import Known
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import ExpectedClutter, Gates, Hints
@@ -54,7 +54,7 @@ def test_noise_passes_a_gate_at_its_rate():
     limit, n = gate.threshold(search, rate), gate.cell.size
     hits = np.zeros(2, int)
     for _ in range(count):
-        x = rng.standard_normal((n, size, 2)) @ np.array([1, 1j]) / np.sqrt(2)
+        x = rng.standard_normal((n, 1, size, 2)) @ np.array([1, 1j]) / np.sqrt(2)
         hits[0] += seek(gate, x, None, search).peak[0] > limit
         same = np.broadcast_to(R, (n, size, size))
         hits[1] += seek(gate, x @ root.T, same, search).peak[0] > limit

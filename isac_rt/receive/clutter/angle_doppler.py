@@ -25,19 +25,22 @@ from isac_rt.receive.cfar import (
     strongest_peaks,
 )
 from isac_rt.receive.clutter.adaptive import scanned, threshold_of
-from isac_rt.receive.clutter.coherent import (
-    PRUNED,
-    Bucketed,
-    Found,
-    Search,
-    search_plain,
-    search_white,
-    searches,
-)
 from isac_rt.receive.clutter.correction import fit
+from isac_rt.receive.clutter.covariance import Bucketed
 from isac_rt.receive.clutter.gates import Gate, gates_of, seek
 from isac_rt.receive.clutter.neighbours import phases
 from isac_rt.receive.clutter.power import TAPER, Taper, expected_power
+from isac_rt.receive.directions import (
+    FINE,
+    PRUNED,
+    Found,
+    Search,
+    climbed,
+    search_plain,
+    search_white,
+    searches,
+    statistic_of,
+)
 from isac_rt.receive.estimate import OFF_GRID, Estimate, Estimator, LocalSpectra
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import UNION_FLOOR, accumulate, maps_with_power
@@ -51,8 +54,6 @@ alone."""
 QUIET = 0.3
 """Share of the cells, those with the least clutter to be expected, whose median power is taken for
 the noise's."""
-FINE = 0.03, 0.01, 0.003
-"""Steps of the search for a direction around the filter's beam [cosine]."""
 TWO_WAVES = 0.5
 """Where no clutter is expected an echo starts no track if other waves in its cell have more than
 this share of its power: over a wall on one way alone two equal waves arrive. A wall that a UAV
@@ -186,7 +187,8 @@ class AngleDoppler:
         assert hints.clutter is not None  # `expectation` has it
         everything, arms = searches(known.antennas, known.wavenumber)
         limits = self._limits(everything, known), self._limits(arms, known)
-        plain = search_plain(maps, everything, noise, PRUNED * limits[0][0])
+        x = maps.reshape(1, -1, power.size)  # an echo has one look, all channels
+        plain = search_plain(x, everything, noise, PRUNED * limits[0][0])
         ratio, sure = np.zeros((2, power.size), np.float32)
         cosines = np.full((power.size, 2), np.nan)
 
@@ -202,15 +204,15 @@ class AngleDoppler:
         def heard(cell: np.ndarray, search: Search) -> np.ndarray:
             c = search.channels
             x = maps.reshape(*maps.shape[:2], -1)[c.tx[:, None], c.rx[:, None], cell]
-            return np.ascontiguousarray(x.T) / np.float32(np.sqrt(noise))
+            return np.ascontiguousarray(x.T)[:, None] / np.float32(np.sqrt(noise))
 
         R = bucketed.among(arms_of(known)).covariances(*np.divmod(cell, power.shape[1]))
-        found = search_white(heard(cell, arms), R, cell, arms, PRUNED * limits[1][0])
+        found, _ = search_white(heard(cell, arms), R, cell, arms)
         note(found, limits[1])
         # the few that remain with all channels: fewer directions look alike
         cell = cell[found.peak > PRUNED * limits[1][0]]
         R = bucketed.covariances(*np.divmod(cell, power.shape[1]))
-        note(search_white(heard(cell, everything), R, cell, everything, 0.0), limits[0])
+        note(search_white(heard(cell, everything), R, cell, everything)[0], limits[0])
         inverse = dict(zip(cell.tolist(), inverses(R), strict=True))
         for gate in _gates(hints.gates, known, len(power), ratio, cosines):
             quiet = not filled[gate.cell].any()
@@ -280,21 +282,14 @@ def near_beam(
 ) -> np.ndarray:
     """(u_x, u_z) near the filter's beam of the most power of the virtual L, or of the largest
     likelihood of all channels with R^-1 (L, L)."""
-    channels = both_arms(known.antennas) if whitener is None else all_channels(known.antennas)
-    values = estimate.channels[channels.tx, channels.rx]
-    if whitener is not None:
-        values = whitener @ values
-    best = np.array(cosines, float)
-    for step in FINE:
-        i, j = np.meshgrid(np.arange(-2, 3), np.arange(-2, 3), indexing="ij")
-        tried = np.stack(
-            [best[0] + step * i.ravel(), np.zeros(25), best[1] + step * j.ravel()], axis=1
-        )
-        a = channels.steering(tried, known)
-        power = np.abs(a.conj() @ values) ** 2
-        if whitener is not None:
-            power /= ((a.conj() @ whitener) * a).sum(axis=1).real
-        best = tried[power.argmax()][[0, 2]]
+    everything, arms = searches(known.antennas, known.wavenumber)
+    search = arms if whitener is None else everything
+    y = estimate.channels[search.channels.tx, search.channels.rx][None, None]
+    if whitener is None:
+        statistic = statistic_of(y)
+    else:
+        statistic = statistic_of(y @ whitener.T, whitener[None])
+    best = climbed(statistic, cosines[None], search, FINE, 2)[1][0]
     period = 2 * np.pi / (known.wavenumber * known.antennas.spacing)
     best = best - period * np.round(best / period)
     return best if (best**2).sum() <= 1 else np.full(2, np.nan)

@@ -13,7 +13,7 @@ clutter remains the transmit antennas hear the same of it: with c its share of t
 c = 1 - a^H R^-2 a / a^H R^-1 a, one of the L_tx terms grows to 1 + (L_tx - 1) c, and the threshold
 with it.
 
-The search is separable as at the active terminal (`isac_rt.receive.clutter.coherent`).
+The search is separable as at the active terminal (`isac_rt.receive.directions`).
 """
 
 from __future__ import annotations
@@ -24,9 +24,6 @@ from functools import lru_cache
 import numpy as np
 from scipy import ndimage, optimize, special
 
-from isac_rt.frame.antennas import Antennas
-from isac_rt.kernels.hermitian import inverses
-from isac_rt.receive.arms import Channels
 from isac_rt.receive.cfar import (
     LOBE_MARGIN,
     CfarRule,
@@ -36,18 +33,19 @@ from isac_rt.receive.cfar import (
     strongest_peaks,
 )
 from isac_rt.receive.clutter.adaptive import scanned
-from isac_rt.receive.clutter.angle_doppler import FINE, noise_level
-from isac_rt.receive.clutter.coherent import (
-    DIRECTIONS,
+from isac_rt.receive.clutter.angle_doppler import noise_level
+from isac_rt.receive.clutter.covariance import Bucketed
+from isac_rt.receive.clutter.power import TAPER, expected_power
+from isac_rt.receive.directions import (
+    FINE,
     PRUNED,
-    Bucketed,
-    Found,
     Search,
     climbed,
-    denominators,
+    receiver_search,
+    search_plain,
+    search_white,
+    statistic_of,
 )
-from isac_rt.receive.clutter.power import TAPER, expected_power
-from isac_rt.receive.clutter.scan import line_bounds, search_by_power
 from isac_rt.receive.estimate import Estimate, LocalSpectra, standard_deviations
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import UNION_FLOOR
@@ -64,9 +62,6 @@ it."""
 SAME_DIRECTION = 0.2
 """Off a strong path by less than this in both direction cosines, about a resolution of the default
 array, what its lobes could hide is taken for what its removal left."""
-BOUNDED, SCALLOPED = 2, 1.12
-"""Every so many directions of the grid is looked at for the bound, which an arm's power between two
-of them may exceed by this factor in amplitude."""
 STD_CELLS = 0.1
 """Smallest deviation of range and velocity, in cells, of what shares its cell with others."""
 
@@ -94,7 +89,7 @@ class BeamSearch(BySchedule):
             e = self.estimator.at(beam, ratio, row, column)
             found.append(e)
             weak.append(_near(e, known, cosines[row, column]))
-        limit = self._limits(search_of(known.antennas, known.wavenumber), known)[0]
+        limit = self._limits(receiver_search(known.antennas, known.wavenumber), known)[0]
         detections = _described(
             found, np.array(weak).reshape(-1, 2), ratio[rows, bins] * limit, known
         )
@@ -125,12 +120,13 @@ class BeamSearch(BySchedule):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """T over its two thresholds, (rows, P), and its directions (rows, P, 2), Doppler
         centred."""
-        search = search_of(known.antennas, known.wavenumber)
+        search = receiver_search(known.antennas, known.wavenumber)
         limit, least = self._limits(search, known), PRUNED * self._limits(search, known)[0]
         shape = maps.shape[2:]
         ratio, sure = np.zeros((2, maps[0, 0].size), np.float32)
         cosines = np.full((ratio.size, 2), np.nan)
-        plain = search_plain(maps, search, noise, least)
+        x = maps.reshape(*maps.shape[:2], -1)
+        plain = search_plain(x, search, noise, least)
         ratio[plain.cell], sure[plain.cell] = plain.peak / limit[0], plain.peak / limit[1]
         cosines[plain.cell] = plain.cosines
         held = np.fft.ifftshift(expected / noise + left_over.power, axes=1).ravel()
@@ -142,8 +138,8 @@ class BeamSearch(BySchedule):
                 R += Bucketed.of(clutter, known, search, noise, TAPER).covariances(rows, bins)
             else:
                 R += np.eye(R.shape[1], dtype=np.float32)
-            x = maps.reshape(*maps.shape[:2], -1)[:, :, cell].transpose(2, 0, 1)
-            white, common = search_white(x / np.float32(np.sqrt(noise)), R, cell, search, least)
+            y = x[:, :, cell].transpose(2, 0, 1) / np.float32(np.sqrt(noise))
+            white, common = search_white(y, R, cell, search, least)
             ratio[cell] = white.peak / (limit[0] * common)
             sure[cell] = white.peak / (limit[1] * common)
             cosines[cell] = white.cosines
@@ -211,14 +207,6 @@ class Remainder:
         return power[:, None, None] * each.astype(np.complex64)[owner]
 
 
-@lru_cache(maxsize=8)
-def search_of(antennas: Antennas, wavenumber: float) -> Search:
-    """The search over the receivers."""
-    rx = np.arange(antennas.num_rx)
-    channels = Channels(np.zeros_like(rx), rx, antennas.rx_positions)
-    return Search.of(channels, wavenumber, antennas.view_limit)
-
-
 @lru_cache(maxsize=64)
 def field_threshold(lengths: tuple[float, ...], area: float, looks: int, rate: float) -> float:
     """What the largest of a sum of `looks` unit exponential fields exceeds at this rate: by the
@@ -235,117 +223,20 @@ def field_threshold(lengths: tuple[float, ...], area: float, looks: int, rate: f
     return float(optimize.brentq(lambda t: np.log(count(t) / aim), looks, 400.0))
 
 
-def search_plain(maps: np.ndarray, search: Search, noise: float, least: float) -> Found:
-    """The largest T of cells against noise alone; exact where that of the grid is `least` or more.
-    Below it is that of the grid, or a bound without a direction.
-
-    Parameters
-    ----------
-    maps : (L_tx, L_rx, rows, P) complex64 of `channel_maps`
-    noise : mean power of a cell of one channel
-    """
-    looks, size = maps.shape[0], len(search.channels)
-    x, scale = maps.reshape(looks * size, -1), 1 / (size * noise)
-    cell = np.flatnonzero(_bound(x, search, BOUNDED) * SCALLOPED**2 * scale >= least)
-    x = np.take(x, cell, axis=1)
-    peak, cosines = _bound(x, search, 1) * scale, np.full((cell.size, 2), np.nan)
-    some = np.flatnonzero(peak >= least)
-    y = np.ascontiguousarray(x[:, some].T).reshape(-1, looks, size)
-    whole = np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32)
-    peak[some], cosines[some] = _best(y, whole, search)
-    above = peak[some] >= least
-    some, y = some[above], y[above]
-    norm = np.eye(size, dtype=np.complex64)[None] * np.float32(noise)
-    peak[some], cosines[some] = _climbed(y, norm, cosines[some], search)
-    return Found(cell, peak, cosines)
-
-
-def _bound(x: np.ndarray, search: Search, step: int) -> np.ndarray:
-    """(sqrt(max A) + sqrt(max B))^2 of channels (L_tx L_rx, S): of each arm the power in the best
-    of every so many directions, summed over the transmit antennas, bounds what both can hold
-    together in one of them."""
-    size = len(search.channels)
-    first, roots = np.arange(0, len(x), size)[:, None], np.zeros(x.shape[1], np.float32)
-    for lines in (search.along_x, search.along_z):
-        roots += np.sqrt(line_bounds(x, first + lines.members[0], lines.spectra[0][::step]))
-    return roots**2
-
-
-def search_white(
-    x: np.ndarray, R: np.ndarray, cell: np.ndarray, search: Search, least: float
-) -> tuple[Found, np.ndarray]:
-    """The largest T of cells with covariances, and how much wider than in noise it scatters,
-    1 + (L_tx - 1) c.
-
-    Parameters
-    ----------
-    x : (S, L_tx, L_rx) channels in units of the noise's amplitude
-    R : (S, L_rx, L_rx) covariances in units of the noise
-    cell : (S,) their numbers
-    """
-    inverse = inverses(R)
-    y = np.matmul(x, inverse.transpose(0, 2, 1))
-    peak, cosines = _best(y, 1 / denominators(inverse, search), search)
-    common = np.ones(len(x))
-    some = np.flatnonzero(peak >= least)
-    if some.size:
-        peak[some], cosines[some] = _climbed(y[some], inverse[some], cosines[some], search)
-        a = search.steering(cosines[some])
-        white = np.einsum("sij,sj->si", inverse[some], a)
-        norm = (a.conj() * white).sum(axis=1).real
-        share = 1 - (np.abs(white) ** 2).sum(axis=1) / norm
-        common[some] = 1 + (x.shape[1] - 1) * np.clip(share, 0, 1)
-    return Found(cell, peak, cosines), common
-
-
-def _climbed(
-    y: np.ndarray, inverse: np.ndarray, cosines: np.ndarray, search: Search
-) -> tuple[np.ndarray, np.ndarray]:
-    """The largest statistic near directions (S, 2), and where."""
-
-    def statistic(a: np.ndarray) -> np.ndarray:
-        norm = ((a.conj() @ inverse) * a).sum(axis=-1).real
-        return (np.abs(a.conj() @ y.transpose(0, 2, 1)) ** 2).sum(axis=2) / norm
-
-    return climbed(statistic, cosines, search)
-
-
-def _best(y: np.ndarray, scale: np.ndarray, search: Search) -> tuple[np.ndarray, np.ndarray]:
-    """The largest statistic over the grid of directions, and where, of cells (S, L_tx, L_rx)."""
-    X, Z = search.along_x, search.along_z
-    each = y.reshape(-1, y.shape[2])
-    turned = (  # either arm's turn at the other's place is taken out of both
-        (one.members[0], one.spectra[0] * other.turns[0].conj()[:, None])
-        for one, other in ((X, Z), (Z, X))
-    )
-    along_x, along_z = (
-        (each[:, members] @ spectra.T).reshape(*y.shape[:2], DIRECTIONS)
-        for members, spectra in turned
-    )
-    peak, place = np.zeros(len(y), np.float32), np.zeros((len(y), 2), np.int64)
-    scale = np.where(search.inside, scale, 0).astype(np.float32)
-    search_by_power(along_x, along_z, scale, peak, place)
-    return peak, search.cosines[place]
-
-
 class _Beam(LocalSpectra):
     """The rows around a peak, of which only the power towards one direction counts."""
 
     def __init__(self, spectra: np.ndarray, known: Known, row: int, cosines: np.ndarray) -> None:
-        towards = search_of(known.antennas, known.wavenumber).steering(cosines).conj()
+        towards = receiver_search(known.antennas, known.wavenumber).steering(cosines).conj()
         beam = np.tile(towards.astype(complex), (known.antennas.num_tx, 1))
         super().__init__(spectra, known, row, beam=beam)
 
 
 def _near(estimate: Estimate, known: Known, cosines: np.ndarray) -> np.ndarray:
     """(u_x, u_z) of the most power near a direction; NaN beyond the horizon."""
-    search = search_of(known.antennas, known.wavenumber)
-    best = np.array(cosines, float)
-    around = np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3), indexing="ij"), axis=-1)
-    for step in FINE:
-        tried = best + step * around.reshape(25, 2)
-        power = (np.abs(search.steering(tried).conj() @ estimate.channels.T) ** 2).sum(axis=1)
-        best = tried[power.argmax()]
+    search = receiver_search(known.antennas, known.wavenumber)
+    statistic = statistic_of(estimate.channels[None])
+    best = climbed(statistic, cosines[None], search, FINE, 2)[1][0]
     return best if (best**2).sum() <= 1 else np.full(2, np.nan)
 
 

@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 
 from isac_rt.kernels.hermitian import inverses
 from isac_rt.receive.clutter.adaptive import expected_count, scanned_within
-from isac_rt.receive.clutter.coherent import Found, Search
+from isac_rt.receive.directions import Found, Search, statistic_of
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import Gates
 
@@ -84,20 +84,18 @@ def seek(
     covariances: np.ndarray | None,
     search: Search,
 ) -> Found:
-    """The largest T in a gate.
+    """Return the largest T in a gate.
 
     Parameters
     ----------
-    x : (S, L) channels of the gate's cells in units of the noise's amplitude
+    x : (S, 1, L) channels of the gate's cells in units of the noise's amplitude
     covariances : (S, L, L) of noise and clutter in units of the noise; None: noise alone
     """
-    a = search.steering(gate.cosines)
     if covariances is None:
-        values = np.abs(x @ a.conj().T) ** 2 / len(search.channels)
+        statistic = statistic_of(x, scale=1 / len(search.channels))
     else:
         inverse = inverses(covariances)
-        y = np.einsum("sij,sj->si", inverse, x)
-        norm = np.einsum("di,sij,dj->sd", a.conj(), inverse, a, optimize=True).real
-        values = np.abs(y @ a.conj().T) ** 2 / np.maximum(norm, 1e-6)
+        statistic = statistic_of(np.matmul(x, inverse.transpose(0, 2, 1)), inverse)
+    values = statistic(search.steering(gate.cosines)[None])
     s, d = np.unravel_index(values.argmax(), values.shape)
     return Found(gate.cell[[s]], values[[s], d], gate.cosines[[d]])

@@ -20,13 +20,12 @@ import numpy as np
 import scipy.fft
 
 from isac_rt.frame.waveform import Waveform
+from isac_rt.kernels.receive_directions import REACH
 from isac_rt.receive.estimate import hann_response
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import slow_window
 from isac_rt.receive.types import ExpectedClutter
 
-REACH = 6
-"""Range cells on each side that a scatterer is followed; Hann's sidelobes are 55 dB down there."""
 FINE_BEAT, FINE_DOPPLER = 2, 3
 """Grid points per range cell, to the nearest of which a scatterer goes, and per Doppler bin,
 between two of which its power is shared."""

@@ -29,6 +29,7 @@ from isac_rt.frame.payload import by_antenna, demodulate_bits, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.vector import new_memory
 from isac_rt.receive.arms import element_delays
+from isac_rt.receive.directions import climbed, receiver_search
 from isac_rt.receive.symbols.beams import rate_error, transitions_of
 from isac_rt.receive.symbols.powers import Symbols, known_cycles, nearest_symbols
 from isac_rt.receive.transform import transform
@@ -318,22 +319,21 @@ def _weights(direction: np.ndarray, antennas: Antennas, waveform: Waveform) -> n
 
 def _direction(batch: Sequence[Peaks], antennas: Antennas, waveform: Waveform) -> np.ndarray:
     """Direction (2,) from which most of the chirps' strongest cells come."""
-    R = 0.0
+    R = np.zeros((antennas.num_rx, antennas.num_rx), complex)
     for one in batch:
         first = one.values[:, :, 0].reshape(-1, antennas.num_rx) / np.sqrt(one.noise)
-        R = R + first.T @ first.conj()
-    axis = np.linspace(-1, 1, 49)
-    step, centre = axis[1] - axis[0], np.zeros(2)
+        R += first.T @ first.conj()
+    wavenumber = 2 * np.pi * waveform.effective_carrier / SPEED_OF_LIGHT
+    search, axis = receiver_search(antennas, wavenumber), np.linspace(-1, 1, 49)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-    for _ in range(6):
-        grid = grid[(grid**2).sum(axis=1) <= 1]
-        delays = element_delays(antennas.rx_positions, grid, np.inf)[0]
-        a = np.exp(2j * np.pi * waveform.effective_carrier * delays)
-        centre = grid[np.einsum("gi,ij,gj->g", a.conj(), R, a).real.argmax()]
-        step /= 2
-        near = step * np.arange(-2, 3)
-        grid = centre + np.stack(np.meshgrid(near, near, indexing="ij"), axis=-1).reshape(-1, 2)
-    return centre
+    grid = grid[(grid**2).sum(axis=1) <= 1]
+
+    def power(a: np.ndarray) -> np.ndarray:
+        return np.asarray(((a.conj() @ R) * a).sum(axis=-1).real)
+
+    best = grid[power(search.steering(grid)).argmax()]
+    steps = (axis[1] - axis[0]) / 2 ** np.arange(1.0, 6.0)
+    return climbed(power, best[None], search, steps.tolist(), 2)[1][0]
 
 
 def _comb(seen: Sequence[_Seen], waveform: Waveform) -> tuple[np.ndarray, np.ndarray] | None:

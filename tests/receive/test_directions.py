@@ -1,4 +1,4 @@
-"""Kernels of the search for directions against sums written out in numpy."""
+"""Searches of cells for directions against sums written out in numpy."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ from receiver_cubes import ANTENNAS
 
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.arms import all_channels
-from isac_rt.receive.clutter import bistatic
-from isac_rt.receive.clutter.coherent import Search, denominators, search_plain
-from isac_rt.receive.clutter.scan import (
+from isac_rt.receive.directions import (
+    Search,
+    denominators,
     line_bounds,
-    search_by_power,
-    search_coherent,
+    receiver_search,
+    search_plain,
 )
 from isac_rt.receive.known import Known
 
-GRID = 32
 ROUNDING = 1e-5  # float32
 
 
@@ -27,7 +26,7 @@ def noise(rng: np.random.Generator, *shape: int) -> np.ndarray:
     return (rng.standard_normal((*shape, 2)) @ [1, 1j]).astype(np.complex64)
 
 
-@pytest.mark.parametrize("cells", [5, 64, 83])
+@pytest.mark.parametrize("cells", [5, 83])
 def test_bounds_are_the_largest_power_over_a_lines_directions(cells: int):
     """Planted bugs: the looks' amplitudes added, not their powers; the last cells, which fill no
     vector, left out; every second direction left out."""
@@ -53,12 +52,10 @@ def test_the_bounds_of_the_coherent_search_miss_nothing():
     lines along X alone.
     """
     search, rng, least, count = coherent_search(ANTENNAS), np.random.default_rng(7), 16.0, 900
-    c = search.channels
-    maps = noise(rng, ANTENNAS.num_tx, ANTENNAS.num_rx, count) / np.float32(np.sqrt(2))
+    x = noise(rng, 1, len(search.channels), count) / np.float32(np.sqrt(2))
     paths = search.steering(rng.uniform(-0.6, 0.6, (count, 2))).T * noise(rng, 1, count)
-    maps[c.tx, c.rx] += np.float32(0.5) * paths
-    maps = maps.reshape(*maps.shape[:2], 30, 30)
-    every, found = search_plain(maps, search, 1.0, 0.0), search_plain(maps, search, 1.0, least)
+    x += np.float32(0.5) * paths
+    every, found = search_plain(x, search, 1.0, 0.0), search_plain(x, search, 1.0, least)
     assert every.cell.size == count > found.cell.size
     peak, place = np.zeros(count), np.full((count, 2), np.nan)
     peak[found.cell], place[found.cell] = found.peak, found.cosines
@@ -78,48 +75,12 @@ def test_a_wave_between_the_grids_directions_passes_the_bounds(antennas):
     below 0.9 are not looked at further. Planted bugs: either bound not raised; a raise of steps
     half as wide."""
     search, limit = coherent_search(antennas), 16.0
-    c, step = search.channels, search.cosines[1] - search.cosines[0]
+    step = search.cosines[1] - search.cosines[0]
     u = step * np.array([[0, 0], [3, -4], [-8, 5], [11, 6]])
-    maps = np.zeros((antennas.num_tx, antennas.num_rx, 2, 2), np.complex64)
-    waves = np.sqrt(1.01 * limit / len(c)) * search.steering(u).T
-    maps[c.tx, c.rx] = waves.reshape(-1, 2, 2)
-    found = search_plain(maps, search, 1.0, 0.9 * limit)
+    waves = np.sqrt(1.01 * limit / len(search.channels)) * search.steering(u).T
+    found = search_plain(waves[None].astype(np.complex64), search, 1.0, 0.9 * limit)
     np.testing.assert_allclose(found.peak, 1.01 * limit, rtol=2e-3)
     np.testing.assert_allclose(found.cosines, u, atol=0.1 * step)
-
-
-@pytest.mark.parametrize("scales", [1, 9])
-def test_the_coherent_search_finds_the_largest_inside(scales: int):
-    """Off the edges the parabola moves a place by half a step at most and no power down. Planted
-    bugs: the turns of both axes exchanged; one scale for all cells; beyond the disc too."""
-    rng = np.random.default_rng(2)
-    x, z = noise(rng, 9, 2, GRID), noise(rng, 9, 3, GRID)
-    turn_z, turn_x = noise(rng, 2, GRID), noise(rng, 3, GRID)
-    scale = rng.uniform(0.5, 1.5, (scales, GRID, GRID)).astype(np.float32)
-    inside = rng.uniform(size=(GRID, GRID)) < 0.3
-    peak, place = np.zeros(9, np.float32), np.zeros((9, 2), np.float32)
-    turns = (np.stack([t.real, t.imag]) for t in (turn_z, turn_x))
-    search_coherent(x, z, *turns, inside.ravel().astype(np.float32), scale, peak, place)
-    total = np.einsum("ski,kj->sij", x, turn_z) + np.einsum("slj,li->sij", z, turn_x)
-    power = np.where(inside, np.abs(total) ** 2 * scale, 0).reshape(9, -1)
-    best = np.column_stack(np.unravel_index(power.argmax(axis=1), inside.shape))
-    assert np.abs(place - best).max() <= 0.5
-    edge = ((best == 0) | (best == GRID - 1)).all(axis=1)
-    assert (peak >= power.max(axis=1) * (1 - ROUNDING)).all()
-    np.testing.assert_allclose(peak[edge], power.max(axis=1)[edge], rtol=ROUNDING)
-
-
-@pytest.mark.parametrize("scales", [1, 9])
-def test_the_search_by_power_finds_the_largest(scales: int):
-    """Planted bugs: the looks added in amplitude; the places of both axes exchanged."""
-    rng = np.random.default_rng(3)
-    x, z = noise(rng, 9, 3, GRID), noise(rng, 9, 3, GRID)
-    scale = rng.uniform(0, 1.5, (scales, GRID, GRID)).astype(np.float32)
-    peak, place = np.zeros(9, np.float32), np.zeros((9, 2), np.int64)
-    search_by_power(x, z, scale, peak, place)
-    power = ((np.abs(x[..., None] + z[:, :, None]) ** 2).sum(axis=1) * scale).reshape(9, -1)
-    np.testing.assert_allclose(peak, power.max(axis=1), rtol=ROUNDING)
-    assert np.array_equal(place @ [GRID, 1], power.argmax(axis=1))
 
 
 @pytest.mark.parametrize("antennas", [ANTENNAS, replace(ANTENNAS, rx_x=5, rx_z=6)])
@@ -128,7 +89,7 @@ def test_denominators_are_the_quadratic_forms_of_the_steering_vectors(antennas, 
     """Every direction of the grid, 18 matrices. Planted bugs: what couples both axes once and not
     twice; turns of two lines not conjugated; channels in another order; the last matrices left
     out."""
-    search = bistatic.search_of(antennas, 30.0) if one_way else coherent_search(antennas)
+    search = receiver_search(antennas, 30.0) if one_way else coherent_search(antennas)
     rng, size = np.random.default_rng(4), len(search.channels)
     mixed = noise(rng, 18, size, size)
     Q = np.eye(size) + mixed @ mixed.conj().transpose(0, 2, 1)

@@ -1,4 +1,4 @@
-"""Kernels of the search for directions, sixteen cells or directions at once."""
+"""Searches for directions, and covariances of clutter, sixteen cells or directions at once."""
 
 from __future__ import annotations
 
@@ -9,30 +9,17 @@ import numpy as np
 from isac_rt.kernels.jit import jit
 from isac_rt.kernels.vector import LANES, evens, larger, load, odds, splat, store, transpose
 
-
-def line_bounds(maps: np.ndarray, channels: np.ndarray, spectra: np.ndarray) -> np.ndarray:
-    """(S,) largest power of each cell in a line's directions, added over the looks.
-
-    Parameters
-    ----------
-    maps : (C, S) complex64
-    channels : (looks, n) numbers of the line's channels
-    spectra : (G, n) complex64 of the line in its directions, an even number
-    """
-    floats = _whole_vectors(maps)
-    out = np.empty(floats.shape[1] // 2, np.float32)
-    parts = np.ascontiguousarray(spectra.real), np.ascontiguousarray(spectra.imag)
-    _line_bounds(floats, channels, *parts, out)
-    return out[: maps.shape[1]]
-
-
-def _whole_vectors(maps: np.ndarray) -> np.ndarray:
-    """Complex maps (C, S) as real and imaginary parts in turn, with zeros after the last cell where
-    it fills no vector."""
-    short = -maps.shape[1] % LANES
-    if short:
-        maps = np.pad(maps, ((0, 0), (0, short)))
-    return np.ascontiguousarray(maps).view(np.float32)
+REACH = 6
+"""Range cells and Doppler bins on each side of a cell whose scatterers count in its covariance;
+Hann's sidelobes are 55 dB down there."""
+TABLE_STEPS = 32
+"""Entries per cell of the tables of responses."""
+LEAST_WEIGHT = 1e-3
+"""Scatterers weaker in a cell than this share of the noise are left out of its covariance."""
+TOGETHER = 8
+"""Scatterers that are added to a covariance at once."""
+TIE = 1e-9
+"""Share by which a direction must be stronger: both ends of the axis may be the same one."""
 
 
 @jit(borrows=True)
@@ -44,11 +31,11 @@ def _hear(flat, at, to, heard):
 
 
 @jit
-def _line_bounds(maps, channels, cosines, sines, out):
-    """`line_bounds`, two directions at a time; complex maps as real and imaginary parts in turn."""
+def line_bounds(maps, channels, spectra, out):
+    """`isac_rt.receive.directions.fill_line_bounds`, two directions at a time."""
     looks, count = channels.shape
     width, line = maps.shape[1], 2 * LANES * count
-    flat, cosine, sine = maps.reshape(-1), cosines.reshape(-1), sines.reshape(-1)
+    flat = maps.reshape(-1)
     heard, zero = np.empty(looks * line, np.float32), splat(np.float32(0))
     for first in range(0, out.size, LANES):
         for t in range(looks):
@@ -56,16 +43,16 @@ def _line_bounds(maps, channels, cosines, sines, out):
                 at = channels[t, e] * width + 2 * first
                 _hear(flat, at, t * line + 2 * LANES * e, heard)
         largest = zero
-        for g in range(0, len(cosines), 2):
+        for g in range(0, len(spectra), 2):
             one, other = zero, zero
             for t in range(looks):
                 re_1, im_1, re_2, im_2 = zero, zero, zero, zero
                 for e in range(count):
-                    at, to = g * count + e, t * line + 2 * LANES * e
+                    to = t * line + 2 * LANES * e
                     re, im = load(heard, to), load(heard, to + LANES)
-                    c, s = splat(cosine[at]), splat(sine[at])
+                    c, s = splat(spectra[g, e].real), splat(spectra[g, e].imag)
                     re_1, im_1 = re_1 + c * re - s * im, im_1 + c * im + s * re
-                    c, s = splat(cosine[at + count]), splat(sine[at + count])
+                    c, s = splat(spectra[g + 1, e].real), splat(spectra[g + 1, e].imag)
                     re_2, im_2 = re_2 + c * re - s * im, im_2 + c * im + s * re
                 one = one + re_1 * re_1 + im_1 * im_1
                 other = other + re_2 * re_2 + im_2 * im_2
@@ -74,39 +61,33 @@ def _line_bounds(maps, channels, cosines, sines, out):
 
 
 @jit(fast=True)
-def search_coherent(along_x, along_z, turns_z, turns_x, inside, scale, peak, place):
-    """Largest |a^H y|^2 times the scale of each cell, and its place in steps of the grid, between
-    its neighbours on both axes.
-
-    Parameters
-    ----------
-    along_x, along_z : (S, lines, G) complex64 spectra of the lines
-    turns_z, turns_x : (2, lines, G) float32, cosines and sines of the lines' places on the other
-        axis
-    inside : (G G) float32, 1 for directions of the unit disc, else 0
-    scale : (S or 1, G, G) float32
-    peak, place : (S,) and (S, 2) float32, filled
-    """
-    size, lines = along_x.shape[2], along_z.shape[1]
+def search_directions(along_x, along_z, turns_z, turns_x, inside, scale, peak, place):
+    """`isac_rt.receive.directions.search_directions`, sixteen directions at once."""
+    looks, size, lines = along_x.shape[1], along_x.shape[3], along_z.shape[2]
     turns, each, power = turns_z.reshape(-1), scale.reshape(-1), np.empty(size * size, np.float32)
-    heard, zero = np.empty(2 * lines * size, np.float32), splat(np.float32(0))
-    sine = turns_z.shape[1] * size
+    heard, zero = np.empty(looks * 2 * lines * size, np.float32), splat(np.float32(0))
+    sine, line = turns_z.shape[1] * size, 2 * lines * size
     for s in range(along_x.shape[0]):
         norm = min(s, scale.shape[0] - 1) * power.size
-        _apart(along_z[s], heard)
+        for t in range(looks):
+            _apart(along_z[s, t], heard[t * line : (t + 1) * line])
         for i in range(size):
             for j in range(0, size, LANES):
-                re, im = zero, zero
-                for k in range(along_x.shape[1]):
-                    a, b = splat(along_x[s, k, i].real), splat(along_x[s, k, i].imag)
-                    c, d = load(turns, k * size + j), load(turns, sine + k * size + j)
-                    re, im = re + a * c - b * d, im + a * d + b * c
-                for k in range(lines):
-                    a, b = splat(turns_x[0, k, i]), splat(turns_x[1, k, i])
-                    c, d = load(heard, k * size + j), load(heard, (lines + k) * size + j)
-                    re, im = re + a * c - b * d, im + a * d + b * c
+                total = zero
+                for t in range(looks):
+                    re, im = zero, zero
+                    for k in range(along_x.shape[2]):
+                        a, b = splat(along_x[s, t, k, i].real), splat(along_x[s, t, k, i].imag)
+                        c, d = load(turns, k * size + j), load(turns, sine + k * size + j)
+                        re, im = re + a * c - b * d, im + a * d + b * c
+                    for k in range(lines):
+                        a, b = splat(turns_x[0, k, i]), splat(turns_x[1, k, i])
+                        at = t * line + k * size + j
+                        c, d = load(heard, at), load(heard, at + lines * size)
+                        re, im = re + a * c - b * d, im + a * d + b * c
+                    total = total + (re * re + im * im)
                 at = i * size + j
-                store(power, at, (re * re + im * im) * load(each, norm + at))
+                store(power, at, total * load(each, norm + at))
         best = _largest(power, inside)
         peak[s] = power[best]
         for axis, step in enumerate((size, 1)):
@@ -114,37 +95,6 @@ def search_coherent(along_x, along_z, turns_z, turns_x, inside, scale, peak, pla
             place[s, axis] = at
             if 0 < at < size - 1:
                 _between(power[best - step], power[best], power[best + step], s, axis, peak, place)
-
-
-@jit(fast=True)
-def search_by_power(along_x, along_z, scale, peak, place):
-    """Largest sum over the transmit antennas of |along_x(i) + along_z(j)|^2 times the scale of
-    each cell, and its place (i, j) on the grid.
-
-    Parameters
-    ----------
-    along_x, along_z : (S, L_tx, G) complex64
-    scale : (S or 1, G, G) float32, 0 beyond the unit disc
-    peak, place : (S,) float32 and (S, 2) int64, filled
-    """
-    looks, size = along_x.shape[1:]
-    each, power = scale.reshape(-1), np.empty(size * size, np.float32)
-    every, zero = np.ones(size * size, np.float32), splat(np.float32(0))
-    heard = np.empty(2 * looks * size, np.float32)
-    for s in range(along_x.shape[0]):
-        norm = min(s, scale.shape[0] - 1) * power.size
-        _apart(along_z[s], heard)
-        for i in range(size):
-            for j in range(0, size, LANES):
-                total = zero
-                for t in range(looks):
-                    re = splat(along_x[s, t, i].real) + load(heard, t * size + j)
-                    im = splat(along_x[s, t, i].imag) + load(heard, (looks + t) * size + j)
-                    total = total + re * re + im * im
-                at = i * size + j
-                store(power, at, total * load(each, norm + at))
-        best = _largest(power, every)
-        peak[s], place[s, 0], place[s, 1] = power[best], best // size, best % size
 
 
 @jit(borrows=True)
@@ -204,11 +154,10 @@ class Axis(NamedTuple):
 
 @jit(fast=True)
 def quadratic_forms(matrices, order, x, z, out):
-    """a^H Q a of all directions, out (S, G, G), from Hermitian matrices Q (S, L, L) of channels
-    which `order` sorts: those of `x`, an `Axis`, then those of `z`.
+    """`isac_rt.receive.directions.quadratic_forms`, sixteen matrices at once.
 
-    Within the lines along an axis it depends on one cosine alone; what couples an X with a Z line
-    is a product of both spectra.
+    Within the lines along an axis a form depends on one cosine alone; what couples an X with a Z
+    line is a product of both spectra.
     """
     count, size, pair = order.size, x.cosines.shape[0], 2 * LANES
     num_x, num_z = x.cosines.shape[1], z.cosines.shape[1]
@@ -287,3 +236,115 @@ def _within(heard, count, begin, lines, total, step, other):
                     at = (g * step + h * other) * LANES
                     turned = re * splat(a * c + b * d) - im * splat(b * c - a * d)
                     store(total, at, load(total, at) + turned)
+
+
+@jit(fast=True)
+def covariances(cells, scatterers, tables, shape, out):
+    """`isac_rt.receive.clutter.covariance.fill_covariances`, `TOGETHER` scatterers at a time."""
+    rows, bins, num_bins = cells
+    start, beat, doppler, power, steer = scatterers
+    size = steer.shape[1]
+    width = size + -size % LANES
+    most = np.zeros((2, REACH + 1), np.float32)  # of a response, so many cells off
+    for axis in range(2):
+        for k in range(REACH * TABLE_STEPS + TABLE_STEPS // 2 + 1):
+            cell = (k + TABLE_STEPS // 2) // TABLE_STEPS
+            most[axis, cell] = max(most[axis, cell], tables[axis][k])
+            if k % TABLE_STEPS == TABLE_STEPS // 2:  # between two cells
+                most[axis, cell - 1] = max(most[axis, cell - 1], tables[axis][k])
+    # what lies beyond the channels stays zero
+    re, im = np.zeros(TOGETHER * width, np.float32), np.zeros(TOGETHER * width, np.float32)
+    sums = np.zeros((2, size, width), np.float32)
+    for c in range(rows.size):
+        sums[:], count = 0.0, 0
+        for i in range(-REACH, REACH + 1):
+            row = rows[c] + i
+            if row < 0 or row >= (start.size - 1) // num_bins:
+                continue
+            for j in range(-REACH, REACH + 1):
+                bucket = row * num_bins + (bins[c] + j) % num_bins
+                least = LEAST_WEIGHT / (most[0, abs(i)] * most[1, abs(j)])
+                for s in range(start[bucket], start[bucket + 1]):
+                    if power[s] < least:
+                        break  # the strongest stand first
+                    at_r = abs(i + beat[s]) * TABLE_STEPS
+                    at_d = abs(j + doppler[s]) * TABLE_STEPS
+                    weight = power[s] * tables[0][int(at_r + 0.5)] * tables[1][int(at_d + 0.5)]
+                    if weight < LEAST_WEIGHT:
+                        continue
+                    root = np.sqrt(weight)
+                    for k in range(size):
+                        re[count * width + k] = steer[s, k].real * root
+                        im[count * width + k] = steer[s, k].imag * root
+                    count += 1
+                    if count == TOGETHER:
+                        _add_products(re, im, count, size, sums)
+                        count = 0
+        _add_products(re, im, count, size, sums)
+        for k in range(size):
+            for m in range(k):
+                value = complex(sums[0, k, m], sums[1, k, m]) * shape[k, m]
+                out[c, k, m], out[c, m, k] = value, value.conjugate()
+            out[c, k, k] = 1.0 + sums[0, k, k] * shape[k, k]
+
+
+@jit(fast=True, borrows=True)
+def _add_products(re, im, count, size, sums):
+    """sums[k, m] += x[q, k] x[q, m]^* over q < `count`, for m <= k, and some that no one reads."""
+    width, flat = sums.shape[2], sums.reshape(-1)
+    for k in range(size):
+        for m in range(0, k + 1, LANES):
+            at, other = k * width + m, (size + k) * width + m
+            c, d = load(flat, at), load(flat, other)
+            for q in range(0, count * width, width):
+                a, b = splat(re[q + k]), splat(im[q + k])
+                x, y = load(re, q + m), load(im, q + m)
+                c, d = c + a * x + b * y, d + b * x - a * y
+            store(flat, at, c)
+            store(flat, other, d)
+
+
+@jit
+def strongest(values, apart, limit, count, fine, out):
+    """`isac_rt.receive.estimate.fill_strongest`."""
+    for q in range(out.size):
+        out[q] = _strongest(values[q], apart, limit, count, fine)
+
+
+@jit
+def _strongest(values, apart, limit, count, fine):
+    """Direction cosine of the most power, of `count` from -limit to `limit`, and `fine` about the
+    best of them by parabolas through the logarithm; `values` (T, L) of elements at `apart`
+    [rad]."""
+    step = 2 * limit / (count - 1)
+    turn, move = np.exp(-1j * limit * apart), np.exp(1j * step * apart)
+    best, most = -limit, -1.0
+    for i in range(count):
+        power = _beam(values, turn)
+        if power > most * (1 + TIE):
+            best, most = -limit + i * step, power
+        turn *= move
+    for part in (2.0, 12.0, 60.0):
+        if not fine:
+            break
+        near = step / part
+        low = np.log(max(_beam(values, np.exp(1j * (best - near) * apart)), 1e-300))
+        mid = np.log(max(_beam(values, np.exp(1j * best * apart)), 1e-300))
+        high = np.log(max(_beam(values, np.exp(1j * (best + near) * apart)), 1e-300))
+        curve = low - 2 * mid + high
+        up = 0.5 * (low - high) / curve * near if curve < 0 else near * np.sign(high - low)
+        best += min(max(up, -2 * near), 2 * near)
+    return best
+
+
+@jit(borrows=True)
+def _beam(values, turn):
+    """Power of the rows of `values` (T, L), each turned by `turn` and added in phase."""
+    power = 0.0
+    for t in range(values.shape[0]):
+        re, im = 0.0, 0.0
+        for i in range(turn.size):
+            re += values[t, i].real * turn[i].real - values[t, i].imag * turn[i].imag
+            im += values[t, i].real * turn[i].imag + values[t, i].imag * turn[i].real
+        power += re * re + im * im
+    return power
