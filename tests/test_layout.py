@@ -15,12 +15,12 @@ PACKAGE = Path(__file__).parent.parent / "isac_rt"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 # a room may import itself and those before it
 ORDER = (
-    "runtime randomness storage registry settings document kernels world frame hardware "
+    "runtime randomness storage plain registry settings document kernels world frame hardware "
     "propagation signal receive terminal access scenario results capture simulation sweep views "
     "cli"
 ).split()
 GROUND = {"runtime", "randomness"}
-GROUND_FILES = ("runtime", "randomness", "storage", "registry", "settings", "document")
+GROUND_FILES = ("runtime", "randomness", "storage", "plain", "registry", "settings", "document")
 NEVER = {("receive", "signal"), ("receive", "propagation"), ("world", "frame")}
 """(room, what it must not import although it stands above it)"""
 

@@ -41,14 +41,6 @@ class Schedules:
         groups, chirps = self.usual.shape
         return conventional_schedule(groups, chirps, self.num_tx) if dense else self.usual
 
-    def memory(self) -> list[tuple[str, str, bool]]:
-        """The advice as plain values, for `restore`."""
-        return [(*link, sparse) for link, sparse in self.advice.items()]
-
-    def restore(self, memory: list[tuple[str, str, bool]]) -> None:
-        """Go on from a `memory`."""
-        self.advice = {Link(tx, rx): sparse for tx, rx, sparse in memory}
-
     def take_advice(self, receptions: Mapping[Link, Reception]) -> None:
         """Note what the receivers of a frame advise. One that could not tell keeps its last
         advice."""

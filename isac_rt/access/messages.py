@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import ceil
-from typing import Any
 
 import numpy as np
 
+from isac_rt.plain import Stateful
 from isac_rt.terminal.filter import Gaussian
 from isac_rt.terminal.fusion import (
     Fused,
@@ -108,90 +108,56 @@ class Message:
             + sum(_bits(look, len(look)) for look in self.looks)
         )
 
-    def memory(self) -> list[Any]:
-        """As plain numbers and arrays, for `of_memory`."""
-        return [
-            self.sender,
-            {k: [s.time, list(s.state), s.via] for k, s in self.terminals.items()},
-            {k: [s.time, list(s.numbers), s.via] for k, s in self.kept.items()},
-            [report.memory() for report in self.reports],
-            [look.memory() for look in self.looks],
-            self.left_out,
-        ]
 
-    @classmethod
-    def of_memory(cls, memory: Sequence[Any]) -> Message:
-        """The message that gave a `memory`."""
-        sender, terminals, kept, reports, looks, left_out = memory
-        return cls(
-            sender,
-            {k: Said(time, Gaussian(*state), via) for k, (time, state, via) in terminals.items()},
-            {k: Kept(time, tuple(numbers), via) for k, (time, numbers, via) in kept.items()},
-            [Report.of_memory(report) for report in reports],
-            [Look.of_memory(look) for look in looks],
-            left_out,
-        )
-
-
-class Channel:
+@dataclass
+class Channel(Stateful):
     """The way from one terminal to another: one message at a time.
 
     Attributes
     ----------
     message : on its way, None: the channel is free
+    left : bits of it that have still to come
+    missed : frames of it that were not read
+    waiting : messages whose last frame is over, with the frames of each that may be read late
     """
 
-    def __init__(self) -> None:
-        self.message: Message | None = None
-        self._left = 0
-        self._missed: set[int] = set()
-        self._waiting: list[tuple[Message, set[int]]] = []
+    message: Message | None = None
+    left: int = 0
+    missed: set[int] = field(default_factory=set)
+    waiting: list[tuple[Message, set[int]]] = field(default_factory=list)
 
     def send(self, message: Message) -> None:
         """Put a message on its way; its first frame is the next."""
-        self.message, self._left, self._missed = message, message.bits, set()
+        self.message, self.left, self.missed = message, message.bits, set()
 
     def carry(self, frame: int, capacity: int, read: bool) -> tuple[Message, bool] | None:
         """Let a frame pass that holds `capacity` bits for it and was `read` or not: the message if
         this was its last frame, and whether it arrived."""
         if self.message is None or capacity <= 0:
             return None
-        self._left -= capacity
+        self.left -= capacity
         if not read:
-            self._missed.add(frame)
-        if self._left > 0:
+            self.missed.add(frame)
+        if self.left > 0:
             return None
         message, self.message = self.message, None
-        self._waiting = [(m, f) for m, f in self._waiting if min(f) > frame - BATCH]
-        if self._missed:
-            self._waiting.append((message, self._missed))
-        return message, not self._missed
+        self.waiting = [(m, f) for m, f in self.waiting if min(f) > frame - BATCH]
+        if self.missed:
+            self.waiting.append((message, self.missed))
+        return message, not self.missed
 
     def late(self, frame: int) -> list[Message]:
         """Messages, whole only now that a frame was read which had passed unread."""
-        self._missed.discard(frame)
-        for _, missed in self._waiting:
+        self.missed.discard(frame)
+        for _, missed in self.waiting:
             missed.discard(frame)
-        whole = [message for message, missed in self._waiting if not missed]
-        self._waiting = [(message, missed) for message, missed in self._waiting if missed]
+        whole = [message for message, missed in self.waiting if not missed]
+        self.waiting = [(message, missed) for message, missed in self.waiting if missed]
         return whole
-
-    def memory(self) -> list[Any]:
-        """What is on its way as plain numbers and arrays, for `restore`."""
-        message = None if self.message is None else self.message.memory()
-        waiting = [[m.memory(), sorted(missed)] for m, missed in self._waiting]
-        return [message, self._left, sorted(self._missed), waiting]
-
-    def restore(self, memory: Sequence[Any]) -> None:
-        """Go on from a `memory`."""
-        message, self._left, missed, waiting = memory
-        self.message = None if message is None else Message.of_memory(message)
-        self._missed = set(missed)
-        self._waiting = [(Message.of_memory(m), set(f)) for m, f in waiting]
 
 
 @dataclass
-class Notes:
+class Notes(Stateful):
     """What a terminal knows from itself and from others, and what it has told whom.
 
     Attributes
@@ -297,50 +263,45 @@ class Notes:
         """Of what it has from others and what counts [s]."""
         return tuple(time - report.time for report, via in self.reports.values() if via)
 
-    def memory(self) -> dict[str, Any]:
-        """What is known as plain numbers and arrays, for `restore`."""
-        message = Message(
-            self.name, self.terminals, self.kept, [report for report, _ in self.reports.values()]
-        )
-        return {
-            "known": message.memory(),
-            "via": [via for _, via in self.reports.values()],
-            "told": {
-                listener: [[*key, time] for key, time in times.items()]
-                for listener, times in self.told.items()
-            },
-            "picture": self.picture.memory(),
-        }
 
-    def restore(self, memory: Mapping[str, Any]) -> None:
-        """Go on from a `memory`."""
-        known = Message.of_memory(memory["known"])
-        self.terminals, self.kept = dict(known.terminals), dict(known.kept)
-        pairs = zip(known.reports, memory["via"], strict=True)
-        self.reports = {report.key: (report, via) for report, via in pairs}
-        self.told = {
-            listener: {Key(origin, number): time for origin, number, time in times}
-            for listener, times in memory["told"].items()
-        }
-        self.picture.restore(memory["picture"])
+@dataclass
+class Noted:
+    """What a terminal carries over of detections.
+
+    Attributes
+    ----------
+    terminals : what they said of themselves
+    looks : by time and link, and by whom each was said ("": its own)
+    told : by listener what went there
+    """
+
+    terminals: dict[str, Said] = field(default_factory=dict)
+    looks: dict[tuple[float, str], tuple[Look, str]] = field(default_factory=dict)
+    told: dict[str, set[tuple[float, str]]] = field(default_factory=dict)
 
 
-class Sightings:
+class Sightings(Stateful):
     """What a terminal knows of the detections that others and it have made, and what it has told
     whom.
 
     Attributes
     ----------
     name : of the terminal
-    terminals : what they said of themselves
     tracker : what it makes of all detections
     """
 
     def __init__(self, name: str, tracker: PooledTracker) -> None:
         self.name, self.tracker = name, tracker
-        self.terminals: dict[str, Said] = {}
-        self._looks: dict[tuple[float, str], tuple[Look, str]] = {}
-        self._told: dict[str, set[tuple[float, str]]] = {}
+        self.state = Noted()
+
+    @property
+    def parts(self) -> Mapping[str, Stateful | None]:
+        return {"tracker": self.tracker}
+
+    @property
+    def terminals(self) -> dict[str, Said]:
+        """What terminals said of themselves."""
+        return self.state.terminals
 
     def stand(self, time: float, state: Gaussian) -> None:
         """Take down where it is itself."""
@@ -349,8 +310,8 @@ class Sightings:
     def see(self, look: Look) -> None:
         """Take down the detections of one of its own links after a frame."""
         self._take(look, "")
-        kept, via = self._looks[look.key]
-        self._looks[look.key] = replace(kept, names=self.tracker.names_of(kept)), via
+        kept, via = self.state.looks[look.key]
+        self.state.looks[look.key] = replace(kept, names=self.tracker.names_of(kept)), via
 
     def hear(self, message: Message) -> None:
         """Take down what it does not know yet."""
@@ -359,12 +320,12 @@ class Sightings:
             if name != self.name and (known is None or said.time > known.time):
                 self.terminals[name] = replace(said, via=message.sender)
         for look in message.looks:
-            if look.key not in self._looks:
+            if look.key not in self.state.looks:
                 self._take(look, message.sender)
 
     def _take(self, look: Look, via: str) -> None:
         """A look whose transmitter is not known at all says nothing of places."""
-        self._looks[look.key] = look, via
+        self.state.looks[look.key] = look, via
         tx, rx = look.ends
         if tx == rx:
             self.tracker.add(look, None)
@@ -374,8 +335,8 @@ class Sightings:
 
     def look(self, time: float, acceleration_std: float) -> list[Fused]:
         """Its picture at a time [s], after forgetting what was not said for `HOLD_S`."""
-        self._looks = {k: v for k, v in self._looks.items() if time - k[0] <= HOLD_S}
-        self.terminals = {k: s for k, s in self.terminals.items() if time - s.time <= HOLD_S}
+        self.state.looks = {k: v for k, v in self.state.looks.items() if time - k[0] <= HOLD_S}
+        self.state.terminals = {k: s for k, s in self.terminals.items() if time - s.time <= HOLD_S}
         self.tracker.forget(time)
         known = {
             name: advance(said.state, time - said.time, acceleration_std)
@@ -386,7 +347,10 @@ class Sightings:
     def ages(self, time: float) -> tuple[float, ...]:
         """Of the detections that it has from others and that count [s]."""
         return tuple(
-            time - look.time for look, via in self._looks.values() if via for _ in range(len(look))
+            time - look.time
+            for look, via in self.state.looks.values()
+            if via
+            for _ in range(len(look))
         )
 
     def compose(self, listener: str, capacity: int) -> Message:
@@ -395,10 +359,10 @@ class Sightings:
         not fit is not told later; one detection is told at least."""
         terminals = {k: s for k, s in self.terminals.items() if listener not in (k, s.via)}
         bare = Message(self.name, terminals, {}, [])
-        told = self._told.setdefault(listener, set())
+        told = self.state.told.setdefault(listener, set())
         new = [
             look
-            for key, (look, via) in self._looks.items()
+            for key, (look, via) in self.state.looks.items()
             if listener not in (via, look.ends[1]) and key not in told
         ]
         new.sort(key=lambda look: (-look.time, look.origin))
@@ -412,27 +376,8 @@ class Sightings:
             chosen.append(look.select(look.best(count)))
             room -= _bits(look, count)
             left -= count
-        self._told[listener] = (told | {look.key for look in new}) & self._looks.keys()
+        self.state.told[listener] = (told | {look.key for look in new}) & self.state.looks.keys()
         return replace(bare, looks=chosen, left_out=left)
-
-    def memory(self) -> dict[str, Any]:
-        """What is known as plain numbers and arrays, for `restore`."""
-        looks = [look for look, _ in self._looks.values()]
-        return {
-            "known": Message(self.name, self.terminals, {}, [], looks).memory(),
-            "via": [via for _, via in self._looks.values()],
-            "told": {k: [list(key) for key in sorted(keys)] for k, keys in self._told.items()},
-            "tracker": self.tracker.memory(),
-        }
-
-    def restore(self, memory: Mapping[str, Any]) -> None:
-        """Go on from a `memory`."""
-        known = Message.of_memory(memory["known"])
-        self.terminals = dict(known.terminals)
-        pairs = zip(known.looks, memory["via"], strict=True)
-        self._looks = {look.key: (look, via) for look, via in pairs}
-        self._told = {k: {(t, o) for t, o in keys} for k, keys in memory["told"].items()}
-        self.tracker.restore(memory["tracker"])
 
 
 def _bits(look: Look, detections: int) -> int:

@@ -36,6 +36,7 @@ import mitsuba as mi
 import numpy as np
 
 from isac_rt.frame.link import Link
+from isac_rt.plain import plain
 from isac_rt.propagation.clutter.cells import Density
 from isac_rt.propagation.clutter.field import ClutterField
 from isac_rt.propagation.clutter.merging import NoiseFloor
@@ -432,7 +433,7 @@ class RayTracer:
     @cached_property
     def _city_content(self) -> str:
         """Digest of all of the city that Sionna's solutions depend on."""
-        return checksum(*pack([self._city.plain(), self._scenes.carrier_frequency, mi.variant()]))
+        return checksum(*pack([plain(self._city), self._scenes.carrier_frequency, mi.variant()]))
 
     def _diffuse_hits(self, local: dict[str, Pose], links: list[Link]) -> dict[Link, _Hits]:
         """Hit points and scattered amplitudes of every link, from one solve or from one that an

@@ -7,8 +7,7 @@ detection its own path explains.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from isac_rt.frame.antennas import Antennas, azimuth_elevation, resolutions
 from isac_rt.frame.cube import Transmission
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
+from isac_rt.plain import Stateful
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections, Reception
@@ -54,7 +54,16 @@ class Heard:
     late: tuple[Late, ...] = ()
 
 
-class Scorer:
+@dataclass
+class Remembered:
+    """What is remembered of a link's tracks: by number kind, UAV and path's owner of the detection
+    that fed each last, and by UAV the track that followed it last."""
+
+    labels: dict[int, list[int]] = field(default_factory=dict)
+    followed: dict[int, int] = field(default_factory=dict)
+
+
+class Scorer(Stateful):
     """Holds the frames of one link's receiver against the truth. From frame to frame it remembers
     what explained the latest detection of each track, and which track follows each UAV."""
 
@@ -72,18 +81,7 @@ class Scorer:
         self._observed = antennas.observes(self._passes)
         self._least = CramerRao.of(timetable.waveform, antennas, self._passes)
         self._receivers = receivers
-        self._labels: dict[int, list[int]] = {}
-        self._followed: dict[int, int] = {}
-
-    def memory(self) -> dict[str, Any]:
-        """What is remembered of the tracks as plain numbers, for `restore`."""
-        labels = [[track, *label] for track, label in self._labels.items()]
-        return {"labels": labels, "followed": [list(pair) for pair in self._followed.items()]}
-
-    def restore(self, memory: dict[str, Any]) -> None:
-        """Go on from a `memory`."""
-        self._labels = {track: label for track, *label in memory["labels"]}
-        self._followed = {uav: track for uav, track in memory["followed"]}
+        self.state = Remembered()
 
     def record(
         self, frame: int, paths: PathSet, sent: Transmission, heard: Heard, noise_power: float
@@ -245,18 +243,18 @@ class Scorer:
         columns = np.column_stack([labels.kind, labels.target, labels.uav])
         for track, row in zip(tracks.ids.tolist(), tracks.detection.tolist(), strict=True):
             if row >= 0:
-                self._labels[track] = columns[row].tolist()
-        mine = {track: self._labels.get(track, [-1, -1, -1]) for track in tracks.ids.tolist()}
-        self._labels = mine
+                self.state.labels[track] = columns[row].tolist()
+        mine = {track: self.state.labels.get(track, [-1, -1, -1]) for track in tracks.ids.tolist()}
+        self.state.labels = mine
         kind, target, uav = np.array([*mine.values()], int).reshape(-1, 3).T
         follows = np.full(len(tracks), -1)
         for i, truth in view.seen.items():
             off = self._off(truth, tracks.measured)
             able = (uav == i) & tracks.confirmed & (off <= GATE_RESOLUTIONS)
             if able.any():
-                rank = np.where(tracks.ids == self._followed.get(i), -1.0, off)
+                rank = np.where(tracks.ids == self.state.followed.get(i), -1.0, off)
                 best = int(np.argmin(np.where(able, rank, np.inf)))
-                follows[best], self._followed[i] = i, int(tracks.ids[best])
+                follows[best], self.state.followed[i] = i, int(tracks.ids[best])
         return TrackTable(
             id=tracks.ids,
             range=tracks.range,
@@ -273,7 +271,7 @@ class Scorer:
 
     def _of_friends(self, tracks: TrackSet, friends: np.ndarray) -> np.ndarray:
         """(K,) which tracks a terminal's own path fed last; the reference is one."""
-        uav = np.array([self._labels[track][-1] for track in tracks.ids.tolist()], int)
+        uav = np.array([self.state.labels[track][-1] for track in tracks.ids.tolist()], int)
         return tracks.is_reference | (np.append(friends, False)[uav])
 
     def _chances(self, view: _View, paths: PathSet, sees: Sensitivity) -> dict[int, Chance]:

@@ -6,7 +6,7 @@ The swarm's own terminals are known by what they say of themselves and are not c
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -15,6 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
+from isac_rt.plain import Stateful
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.results.dataset import Columns
 from isac_rt.results.metrics import GOSPA_CUTOFF_M
@@ -69,25 +70,22 @@ class View:
     traffic: Traffic = Traffic()
 
 
-class SwarmScorer:
+@dataclass
+class Remembered:
+    """Which UAVs (U,) each link saw last, and the UAV that fed each track last, -1: none."""
+
+    seen: dict[Link, np.ndarray] = field(default_factory=dict)
+    fed: dict[Key, int] = field(default_factory=dict)
+
+
+class SwarmScorer(Stateful):
     """Holds pictures against the truth. It remembers which UAVs each link saw last, and what fed
     each track last."""
 
     def __init__(self, timetable: Timetable) -> None:
         self._timetable = timetable
         self._origins = [str(link) for link in timetable.labels]
-        self._seen: dict[Link, np.ndarray] = {}
-        self._fed: dict[Key, int] = {}
-
-    def memory(self) -> dict[str, Any]:
-        """What is remembered as plain numbers and arrays, for `restore`."""
-        seen = [[*link, uavs] for link, uavs in self._seen.items()]
-        return {"seen": seen, "fed": [[*key, uav] for key, uav in self._fed.items()]}
-
-    def restore(self, memory: Mapping[str, Any]) -> None:
-        """Go on from a `memory`."""
-        self._seen = {Link(tx, rx): uavs for tx, rx, uavs in memory["seen"]}
-        self._fed = {Key(origin, number): uav for origin, number, uav in memory["fed"]}
+        self.state = Remembered()
 
     def record(
         self,
@@ -106,11 +104,11 @@ class SwarmScorer:
         """
         timetable = self._timetable
         for link, o in observers.items():
-            self._seen[link] = o.in_view & ~o.shadowed
+            self.state.seen[link] = o.in_view & ~o.shadowed
             origin, t = str(link), o.tracks
             fed = np.where(t.kind == PathKind.TARGET, t.target, -1)
-            self._fed |= {Key(origin, int(k)): int(u) for k, u in zip(t.id, fed, strict=True)}
-        now = [uavs for link, uavs in self._seen.items() if timetable.holds(link, frame)]
+            self.state.fed |= {Key(origin, int(k)): int(u) for k, u in zip(t.id, fed, strict=True)}
+        now = [uavs for link, uavs in self.state.seen.items() if timetable.holds(link, frame)]
         roles = timetable.roles(frame)
         target = np.array([role == "target" for role in roles.values()])
         seen = np.any(now, axis=0) & target
@@ -137,7 +135,7 @@ class SwarmScorer:
         follows = np.full(len(bodies), -1)
         error = np.full((len(names), 3), np.nan)
         for u, k in stands.items():
-            if any(self._fed.get(key) == u for key in bodies[k].members):
+            if any(self.state.fed.get(key) == u for key in bodies[k].members):
                 follows[k] = u
                 error[u] = _errors(bodies[k], truth[u])
         return PictureRecord(

@@ -4,19 +4,20 @@ and send the next."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from isac_rt.access.messages import CODE_RATE, CORRECTED, Channel, Notes, Sightings
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.plain import Stateful
 from isac_rt.results.metrics import SymbolCount
 from isac_rt.results.records import LateRecord
 from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
-from isac_rt.terminal.filter import Ambiguity, Gaussian
+from isac_rt.terminal.filter import Ambiguity
 from isac_rt.terminal.fusion import (
     Fused,
     KnownBody,
@@ -37,7 +38,21 @@ AHEAD = 2
 receivers know what they were told until so many frames before it."""
 
 
-class Cooperation:
+@dataclass
+class Talk:
+    """What is on its way between terminals, and what each knew.
+
+    Attributes
+    ----------
+    channels : by way
+    known : by frame its time [s], and by terminal the bodies that it knew of then
+    """
+
+    channels: dict[Link, Channel] = field(default_factory=dict)
+    known: dict[int, tuple[float, dict[str, list[KnownBody]]]] = field(default_factory=dict)
+
+
+class Cooperation(Stateful):
     """The terminals of one set of receivers, with what each knows."""
 
     def __init__(self, setup: Setup) -> None:
@@ -51,11 +66,15 @@ class Cooperation:
             for name in self._names
         }
         self._swarm: Picture | PooledTracker = self._pool() if self._pools else Picture()
-        self._channels: dict[Link, Channel] = {}
+        self.state = Talk()
         self._acceleration = s.tracking.acceleration_std_mps2
         self._feedback = int(s.access.feedback_rate_bps * setup.timetable.interval)
-        self._known: dict[int, tuple[float, dict[str, list[KnownBody]]]] = {}
-        """By frame: its time, and by terminal the bodies that it knew of then."""
+
+    @property
+    def parts(self) -> Mapping[str, Stateful | None]:
+        return {f"notes of {name}": notes for name, notes in self._notes.items()} | {
+            "swarm": self._swarm
+        }
 
     def _pool(self) -> PooledTracker:
         """A tracker of all terminals' detections."""
@@ -101,8 +120,8 @@ class Cooperation:
             for name, notes in self._notes.items()
         }
         together = self._together(time, poses)
-        self._known = {k: v for k, v in self._known.items() if k > frame - AHEAD}
-        self._known[frame] = time, {n: self._bodies(n, views[n], time) for n in self._notes}
+        self.state.known = {k: v for k, v in self.state.known.items() if k > frame - AHEAD}
+        self.state.known[frame] = time, {n: self._bodies(n, views[n], time) for n in self._notes}
         self._send(frame)
         return {**views, SWARM: View(time, tuple(together))}
 
@@ -119,7 +138,7 @@ class Cooperation:
     def told(self, link: Link, frame: int, time: float) -> list[KnownBody]:
         """The bodies that a link's receiver knew of after a frame, at a time [s], but the link's
         ends; none where the frame is not remembered."""
-        then, known = self._known.get(frame, (time, {}))
+        then, known = self.state.known.get(frame, (time, {}))
         return [
             body._replace(state=advance(body.state, time - then, self._acceleration))
             for body in known.get(link.rx, [])
@@ -188,7 +207,7 @@ class Cooperation:
         were lost."""
         came = dict.fromkeys(self._notes, Traffic())
         for way, capacity in self._ways(frame).items():
-            channel = self._channels.setdefault(way, Channel())
+            channel = self.state.channels.setdefault(way, Channel())
             if way in heard:
                 read = heard[way].reception.decoded and _corrected(symbols[way])
             else:
@@ -210,8 +229,8 @@ class Cooperation:
         """What comes with frames that were read late, to be added to what `came`."""
         for way, records in late.items():
             for one in records:
-                if way in self._channels and _corrected(one.symbols):
-                    for message in self._channels[way].late(one.frame):
+                if way in self.state.channels and _corrected(one.symbols):
+                    for message in self.state.channels[way].late(one.frame):
                         came[way.rx] += Traffic(late=1)
                         self._notes[way.rx].hear(message)
 
@@ -221,39 +240,10 @@ class Cooperation:
         if frame + 1 >= self._setup.timetable.frames:
             return
         ways = self._ways(frame + 1)
-        self._channels = {way: self._channels.get(way, Channel()) for way in ways}
-        for way, channel in self._channels.items():
+        self.state.channels = {way: self.state.channels.get(way, Channel()) for way in ways}
+        for way, channel in self.state.channels.items():
             if channel.message is None and ways[way] > 0:
                 channel.send(self._notes[way.tx].compose(way.rx, ways[way]))
-
-    def memory(self) -> dict[str, Any]:
-        """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
-        return {
-            "notes": {name: notes.memory() for name, notes in self._notes.items()},
-            "swarm": self._swarm.memory(),
-            "channels": [[*way, channel.memory()] for way, channel in self._channels.items()],
-            "known": [
-                [frame, time, {n: [[who, *g] for who, g in of] for n, of in bodies.items()}]
-                for frame, (time, bodies) in self._known.items()
-            ],
-        }
-
-    def restore(self, memory: Mapping[str, Any]) -> None:
-        """Go on from a `memory`."""
-        for name, notes in self._notes.items():
-            notes.restore(memory["notes"][name])
-        self._swarm.restore(memory["swarm"])
-        self._channels = {}
-        for tx, rx, kept in memory["channels"]:
-            channel = self._channels[Link(tx, rx)] = Channel()
-            channel.restore(kept)
-        self._known = {
-            frame: (
-                time,
-                {n: [KnownBody(who, Gaussian(*g)) for who, *g in of] for n, of in bodies.items()},
-            )
-            for frame, time, bodies in memory["known"]
-        }
 
 
 def _corrected(count: SymbolCount) -> bool:

@@ -22,6 +22,7 @@ from isac_rt.access.fall_back import Schedules
 from isac_rt.access.feedback import exchange
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.link import Link
+from isac_rt.plain import plain, restored
 from isac_rt.receive.settings import Receivers
 from isac_rt.results.provenance import provenance
 from isac_rt.results.recorder import Figures, Recorder, Results
@@ -690,7 +691,7 @@ class _Run:
             "first": self.kept,
             **own,
             "compared": dict(zip(self.compared, others, strict=True)),
-            "advice": self.schedules.memory(),
+            "advice": plain(self.schedules.advice),
             "seconds": self.stopwatch.so_far(),
         }
 
@@ -710,7 +711,7 @@ class _Run:
                 self.own.restore(last)
                 for name, one in self.compared.items():
                     one.restore(last["compared"][name])
-                self.schedules.restore(last["advice"])
+                self.schedules.advice = restored(dict[Link, bool], last["advice"])
                 self.stopwatch.restore(last["seconds"])
         self.kept = len(self.recorder)
         return self.kept

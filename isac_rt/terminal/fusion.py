@@ -14,12 +14,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import gammaincinv
 
 from isac_rt.kernels.jit import jit
+from isac_rt.plain import Stateful
 from isac_rt.terminal.filter import Gaussian, distance, singer
 from isac_rt.terminal.tracker import LEAST_APART, TrackSet, assign
 from isac_rt.world.swarm import Pose
@@ -123,17 +124,6 @@ class Report:
     def whole(self) -> Gaussian:
         """The state with the errors of who tells."""
         return Told(self.state, self.lever).whole
-
-    def memory(self) -> list[Any]:
-        """As plain numbers and arrays, for `of_memory`."""
-        head = [list(self.key), self.since, list(self.name), self.time]
-        return [*head, list(self.state), self.lever]
-
-    @classmethod
-    def of_memory(cls, memory: Sequence[Any]) -> Report:
-        """The report that gave a `memory`."""
-        key, since, name, time, state, lever = memory
-        return cls(Key(*key), since, Name(*name), time, Gaussian(*state), lever)
 
 
 def at_once(reports: Iterable[Report], time: float, acceleration_std: float) -> list[Report]:
@@ -543,20 +533,12 @@ class _Body:
         return {key.origin for key in self.members}
 
 
-class Picture:
+@dataclass
+class Picture(Stateful):
     """What a listener makes of all tracks that it knows: from frame to frame it remembers which of
     them are one body, and its name."""
 
-    def __init__(self) -> None:
-        self._bodies: list[_Body] = []
-
-    def memory(self) -> list[Any]:
-        """What is remembered as plain numbers and words, for `restore`."""
-        return [[list(b.name), [list(k) for k in b.members]] for b in self._bodies]
-
-    def restore(self, memory: Sequence[Any]) -> None:
-        """Go on from a `memory`."""
-        self._bodies = [_Body(Name(*name), [Key(*k) for k in keys]) for name, keys in memory]
+    bodies: list[_Body] = field(default_factory=list)
 
     def update(
         self, reports: Iterable[Report], known: Mapping[str, Told] | None = None
@@ -575,22 +557,22 @@ class Picture:
         self._unite(whole)
         self._call(by_key)
         known = known or {}
-        states = [intersection_of([whole[k] for k in b.members]) for b in self._bodies]
+        states = [intersection_of([whole[k] for k in b.members]) for b in self.bodies]
         whose = recognise(states, {name: word.whole for name, word in known.items()})
         itself = {k: (name, known[name]) for k, name in enumerate(whose) if name is not None}
-        if self._bodies:
-            members = [[by_key[k] for k in b.members] for b in self._bodies]
+        if self.bodies:
+            members = [[by_key[k] for k in b.members] for b in self.bodies]
             states = together(members, itself)
         return [
             Fused(body.name, in_datum(state), tuple(body.members), terminal)
-            for body, state, terminal in zip(self._bodies, states, whose, strict=True)
+            for body, state, terminal in zip(self.bodies, states, whose, strict=True)
         ]
 
     def _keep(self, whole: Mapping[Key, Gaussian], by_key: Mapping[Key, Report]) -> None:
         """Bodies of the tracks that are still there: those that have left their body, and new
         ones, stand alone."""
         kept, alone = [], dict.fromkeys(by_key)
-        for body in self._bodies:
+        for body in self.bodies:
             members = [key for key in body.members if key in by_key]
             if not members:
                 continue
@@ -612,14 +594,14 @@ class Picture:
             kept.append(body)
             for key in body.members:
                 del alone[key]
-        self._bodies = kept + [_Body(by_key[key].name, [key]) for key in alone]
+        self.bodies = kept + [_Body(by_key[key].name, [key]) for key in alone]
 
     def _join(self, whole: Mapping[Key, Gaussian]) -> None:
         """Tracks that stand alone join bodies that their terminal has no track of, origin by
         origin: as many as the gate allows, of the greatest likelihood."""
         for origin in dict.fromkeys(key.origin for key in sorted(whole)):
-            single = [b for b in self._bodies if len(b.members) == 1 and origin in b.origins()]
-            others = [b for b in self._bodies if origin not in b.origins()]
+            single = [b for b in self.bodies if len(b.members) == 1 and origin in b.origins()]
+            others = [b for b in self.bodies if origin not in b.origins()]
             if not single:
                 continue
             d2, log_det = distances(
@@ -630,32 +612,32 @@ class Picture:
             for i, j in assign(d2 + log_det):
                 others[i].members += single[j].members
                 others[i].name = min(others[i].name, single[j].name)
-                self._bodies.remove(single[j])
+                self.bodies.remove(single[j])
 
     def _unite(self, whole: Mapping[Key, Gaussian]) -> None:
         """Bodies of one terminal's tracks that lie nearer to each other than UAVs fly are one."""
-        states = [intersection_of([whole[k] for k in b.members]) for b in self._bodies]
+        states = [intersection_of([whole[k] for k in b.members]) for b in self.bodies]
         d2, _ = distances(states, states, JOIN_PROBABILITY)
         gone: set[int] = set()
         for i, j in np.argwhere(np.tril(np.isfinite(d2), -1)).tolist():
             if {i, j} & gone:
                 continue
-            body, other = self._bodies[i], self._bodies[j]
+            body, other = self.bodies[i], self.bodies[j]
             pairs = product(body.members, other.members)
             gaps = [_gap(whole[a], whole[b]) for a, b in pairs if a.origin == b.origin]
             if gaps and max(gaps) < LEAST_APART:
                 other.members += body.members
                 other.name = min(body.name, other.name)
                 gone.add(i)
-        self._bodies = [b for i, b in enumerate(self._bodies) if i not in gone]
+        self.bodies = [b for i, b in enumerate(self.bodies) if i not in gone]
 
     def _call(self, by_key: Mapping[Key, Report]) -> None:
         """Names: the earliest that any member is known by; two bodies never have the same. The one
         with the track that the name is of keeps it, else the one that had it before."""
-        for body in self._bodies:
+        for body in self.bodies:
             body.name = min(body.name, *(by_key[key].name for key in body.members))
         holder: dict[Name, _Body] = {}
-        waiting = sorted(self._bodies, key=lambda b: Key(*b.name[1:]) not in b.members)
+        waiting = sorted(self.bodies, key=lambda b: Key(*b.name[1:]) not in b.members)
         for body in waiting:
             if body.name in holder:
                 body.name = min(by_key[key].own_name for key in body.members)

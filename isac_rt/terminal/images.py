@@ -110,11 +110,8 @@ class Doubts:
         suspect = set(tracks.ids[said.suspect].tolist())
         for track in tracker.tracks:
             track.echoed = track.echoed + 1 if track.id in suspect else 0
-        tracker.tracks = [
-            t
-            for t in tracker.tracks
-            if t.echoed < ECHOED_FRAMES and not (t.id in suspect and t.id in confirmed & new)
-        ]
+        echoes = {t.id for t in tracker.tracks if t.echoed >= ECHOED_FRAMES}
+        tracker.drop(echoes | (suspect & confirmed & new))
 
     @cached_property
     def _leeway(self) -> Leeway:

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from isac_rt.plain import Stateful
 from isac_rt.terminal.filter import (
     STD_FLOOR,
     Ambiguity,
@@ -118,20 +119,6 @@ class Look:
         """Rows of the strongest, those of confirmed tracks before all others."""
         return np.sort(np.lexsort((-self.snr, ~self.sure))[:count])
 
-    def memory(self) -> list[Any]:
-        """As plain numbers and arrays, for `of_memory`."""
-        head = [self.origin, self.frame, self.time, self.clock_std, list(vars(self.own).values())]
-        names = [None if name is None else list(name) for name in self.names]
-        return [*head, self.numbers, self.z, self.std, self.snr, self.sure, names, list(self.kept)]
-
-    @classmethod
-    def of_memory(cls, memory: Sequence[Any]) -> Look:
-        """The look that gave a `memory`."""
-        origin, frame, time, clock, pose, numbers, z, std, snr, sure, names, kept = memory
-        named = tuple(None if name is None else Name(*name) for name in names)
-        tables = numbers, z, std, snr, sure
-        return cls(origin, frame, time, Pose(*pose), clock, *tables, named, tuple(kept))
-
 
 @dataclass(frozen=True)
 class Body:
@@ -201,7 +188,16 @@ class Lives:
         )
 
 
-class PooledTracker:
+@dataclass
+class _Known:
+    """What a pooled tracker carries over: the states before the looks that may still be preceded by
+    late ones, and these looks with the states (6,) of their transmitters."""
+
+    begin: Pool
+    looks: list[tuple[Look, np.ndarray | None]] = field(default_factory=list)
+
+
+class PooledTracker(Stateful):
     """The picture that a listener makes of all detections that it knows.
 
     Parameters
@@ -222,8 +218,7 @@ class PooledTracker:
         self._terminals, self._settings, self._lives = list(terminals), settings, lives
         self._ambiguities = ambiguities
         variance = np.tile(_error_variance(), len(self._terminals))
-        self._begin = Pool(-np.inf, np.zeros(variance.size), np.diag(variance))
-        self._looks: list[tuple[Look, np.ndarray | None]] = []
+        self.state = _Known(Pool(-np.inf, np.zeros(variance.size), np.diag(variance)))
         self._pools: list[Pool] = []
 
     def add(self, look: Look, transmitter: np.ndarray | None) -> bool:
@@ -234,59 +229,35 @@ class PooledTracker:
         transmitter : (6,) what the transmitter says of its position and velocity then, of a passive
             terminal's detections
         """
-        if look.time <= self._begin.time:
+        if look.time <= self.state.begin.time:
             return False
-        at = bisect([one.key for one, _ in self._looks], look.key)
-        self._looks.insert(at, (look, transmitter))
+        at = bisect([one.key for one, _ in self.state.looks], look.key)
+        self.state.looks.insert(at, (look, transmitter))
         self._replay(at)
         return True
 
     def _replay(self, first: int) -> None:
         del self._pools[first:]
-        for look, transmitter in self._looks[first:]:
-            before = self._pools[-1] if self._pools else self._begin
+        for look, transmitter in self.state.looks[first:]:
+            before = self._pools[-1] if self._pools else self.state.begin
             self._pools.append(self._step(before, look, transmitter))
 
     def forget(self, time: float) -> None:
         """Nothing that is older than `MOST_LATE` at a time [s] can come any more."""
-        old = [look.time < time - MOST_LATE for look, _ in self._looks].count(True)
+        old = [look.time < time - MOST_LATE for look, _ in self.state.looks].count(True)
         if old:
-            self._begin = self._pools[old - 1]
-            del self._looks[:old], self._pools[:old]
-
-    def memory(self) -> dict[str, Any]:
-        """What is remembered as plain numbers and arrays, for `restore`."""
-        b = self._begin
-        bodies = [
-            [
-                list(o.name),
-                list(o.born),
-                list(o.hits),
-                [[k, *v] for k, v in o.fed.items()],
-                o.confirmed,
-            ]
-            for o in b.bodies
-        ]
-        looks = [[look.memory(), transmitter] for look, transmitter in self._looks]
-        begin = [b.time, b.mean, b.covariance, bodies, dict(b.clocks)]
-        return {"begin": begin, "looks": looks}
+            self.state.begin = self._pools[old - 1]
+            del self.state.looks[:old], self._pools[:old]
 
     def restore(self, memory: Mapping[str, Any]) -> None:
-        """Go on from a `memory`."""
-        time, mean, covariance, rows, clocks = memory["begin"]
-        bodies = tuple(
-            Body(Name(*name), Name(*born), tuple(hits), {k: (n, t) for k, n, t in fed}, confirmed)
-            for name, born, hits, fed, confirmed in rows
-        )
-        self._begin = Pool(time, mean, covariance, bodies, clocks)
-        self._looks = [(Look.of_memory(look), tx) for look, tx in memory["looks"]]
-        self._pools = []
+        """Go on from a `memory`; what the looks show is worked out again."""
+        super().restore(memory)
         self._replay(0)
 
     @property
     def latest(self) -> Pool:
         """After the latest look."""
-        return self._pools[-1] if self._pools else self._begin
+        return self._pools[-1] if self._pools else self.state.begin
 
     def at(self, time: float, known: Mapping[str, Gaussian] | None = None) -> list[Fused]:
         """The confirmed bodies at a time [s].

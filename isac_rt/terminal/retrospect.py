@@ -9,13 +9,13 @@ data are out.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
+from isac_rt.plain import Stateful
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.symbols.blind import DataPath, Peaks, acquire
 from isac_rt.receive.types import Detections, Hints, Reception
@@ -50,21 +50,28 @@ class Late:
     reception: Reception
 
 
-class Retrospect:
+@dataclass
+class Waiting:
+    """Frames that wait for a path, and the path over which frames are read now; None: none is
+    known."""
+
+    batch: list[Peaks] = field(default_factory=list)
+    path: DataPath | None = None
+
+
+class Retrospect(Stateful):
     """What a passive terminal keeps of frames that it could not read, and the path over which it
     reads now.
 
     Attributes
     ----------
-    path : None where none is known
     late : earlier frames that the last one made readable
     """
 
     def __init__(self, receiver: PassiveReceiver, waveform: Waveform) -> None:
         self._receiver, self._waveform = receiver, waveform
         self._cells = np.array([waveform.range_cell(1), waveform.velocity_cell(1)])
-        self._batch: list[Peaks] = []
-        self.path: DataPath | None = None
+        self.state = Waiting()
         self.late: tuple[Late, ...] = ()
 
     def read(
@@ -77,19 +84,19 @@ class Retrospect:
     ) -> Reception | None:
         """A data frame that the line of sight does not read, over the path that is known or that it
         makes known; None where there is none yet."""
-        if self.path is not None:
+        if self.state.path is not None:
             out = self._over(cube, time, hints, maps=maps)
             if out is not None:
                 return out
-        self.path = self._learn(cube, time, True)
-        if self.path is None:
+        self.state.path = self._learn(cube, time, True)
+        if self.state.path is None:
             return None
         return self._over(cube, time, hints, maps=maps)
 
     def look(self, cube: IFCube, time: float) -> None:
         """A frame without data, which tells the whole cells of those that wait."""
-        if self._batch:
-            self.path = self._learn(cube, time, False) or self.path
+        if self.state.batch:
+            self.state.path = self._learn(cube, time, False) or self.state.path
 
     def start(self, detections: Detections, time: float) -> None:
         """Go on over the strongest path of a frame without data whose reference is none."""
@@ -98,37 +105,21 @@ class Retrospect:
             i = int(d.snr.argmax())
             mean = np.array([d.range[i], d.velocity[i], 0.0])
             spread = np.append(self._deviations(d, i), FIRST_BEND) ** 2
-            self.path = DataPath(time, mean, np.diag(spread), d.direction[i])
+            self.state.path = DataPath(time, mean, np.diag(spread), d.direction[i])
 
     def forget(self) -> None:
         """The line of sight reads again."""
-        self.path, self._batch = None, []
-
-    def memory(self) -> dict[str, Any]:
-        """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
-        kept = ("time", "modulated", "schedule", "cells", "values", "noise")
-        return {
-            "batch": [{name: getattr(one, name) for name in kept} for one in self._batch],
-            "path": None if self.path is None else dict(vars(self.path)),
-        }
-
-    def restore(self, memory: dict[str, Any]) -> None:
-        """Go on from a `memory`."""
-        groups, w = self._receiver.groups, self._waveform
-        mine = w if groups is None else w.of_groups(groups)
-        self._batch = [Peaks(waveform=mine, **one) for one in memory["batch"]]
-        path = memory["path"]
-        self.path = None if path is None else DataPath(**path)
+        self.state = Waiting()
 
     def _learn(self, cube: IFCube, time: float, modulated: bool) -> DataPath | None:
         """Keep a frame, and read those that wait where it makes a path known."""
-        young = [one for one in self._batch if time - one.time <= SPAN]
-        self._batch = [*young[1 - BATCH :], self._receiver.peaks(cube, time, modulated)]
+        young = [one for one in self.state.batch if time - one.time <= SPAN]
+        self.state.batch = [*young[1 - BATCH :], self._receiver.peaks(cube, time, modulated)]
         order = self._receiver.reader.order
-        path = acquire(self._batch, self._receiver.antennas, order)
+        path = acquire(self.state.batch, self._receiver.antennas, order)
         if path is None:
             return None
-        waiting, self._batch = self._batch, []
+        waiting, self.state.batch = self.state.batch, []
         for one in waiting:
             if one.modulated and one.time < time:
                 there = path.at(one.time).prediction
@@ -146,24 +137,24 @@ class Retrospect:
         maps: bool,
     ) -> Reception | None:
         """A frame read over the path, which it makes known better; None where it cannot be."""
-        assert self.path is not None
-        self.path = self.path.at(time)
-        expected = self.path.prediction
+        assert self.state.path is not None
+        self.state.path = self.state.path.at(time)
+        expected = self.state.path.prediction
         if expected.range_std[0] > COAST_CELLS * self._cells[0]:
             return None
         out = self._receiver.receive_over(cube, expected, hints, maps=maps)
         if not out.decoded:
             return None
         d = out.detections
-        off = np.abs(np.stack([d.range, d.velocity]).T - self.path.mean[:2])
+        off = np.abs(np.stack([d.range, d.velocity]).T - self.state.path.mean[:2])
         gate = np.maximum(
-            GATE_CELLS * self._cells, GATE_STDS * np.sqrt(np.diag(self.path.covariance)[:2])
+            GATE_CELLS * self._cells, GATE_STDS * np.sqrt(np.diag(self.state.path.covariance)[:2])
         )
         near = (off < gate).all(axis=1) & np.isfinite(d.direction).all(axis=1)
         if near.any():
             i = int(np.where(near, d.snr, -1.0).argmax())
             measured = np.array([d.range[i], d.velocity[i]])
-            self.path = self.path.seen(measured, self._deviations(d, i), d.direction[i])
+            self.state.path = self.state.path.seen(measured, self._deviations(d, i), d.direction[i])
         return out
 
     def _deviations(self, detections: Detections, i: int) -> np.ndarray:

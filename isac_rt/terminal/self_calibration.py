@@ -21,13 +21,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.plain import Stateful
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.modes import MODES, polynomials
 from isac_rt.receive.settings import Receivers
@@ -116,22 +117,38 @@ class Belief:
         return replace(self, information=np.linalg.inv(covariance))
 
 
-class SelfCalibration:
+@dataclass
+class Hardware:
+    """What is known of a terminal's hardware.
+
+    Attributes
+    ----------
+    gains, slopes : of the elements, at the active terminal the transmit elements first
+    common, common_information : (2, MODES) response over the chirp that all elements have,
+        amplitude and phase by mode, of which the first and the phase of the second belong to each
+        path
+    clock, clock_covariance : (2,) delay [s] and rate of paths beyond what the geometry says. An
+        active terminal's boards are so late, and its samples are corrected; at a passive one it is
+        mostly the clocks, and `PassiveTerminal` takes it out of ranges: to turn a tone by a
+        microsecond would turn each data symbol by another phase
+    time : of the last frame [s]
+    """
+
+    gains: Belief
+    slopes: Belief
+    common: np.ndarray
+    common_information: np.ndarray
+    clock: np.ndarray
+    clock_covariance: np.ndarray
+    time: float = np.nan
+
+
+class SelfCalibration(Stateful):
     """What a terminal knows of its hardware, and the correction of its samples by it.
 
     Parameters
     ----------
     passes : 2 at the active terminal, whose transmit elements are its own; 1 at a passive one
-
-    Attributes
-    ----------
-    gains, slopes : Belief of the elements, at the active terminal the transmit elements first
-    common : (2, MODES) response over the chirp that all elements have, amplitude and phase by mode,
-        of which the first and the phase of the second belong to each path
-    clock : (2,) delay [s] and rate of paths beyond what the geometry says. An active terminal's
-        boards are so late, and its samples are corrected; at a passive one it is mostly the clocks,
-        and `PassiveTerminal` takes it out of ranges: to turn a tone by a microsecond would turn
-        each data symbol by another phase
     """
 
     def __init__(self, waveform: Waveform, antennas: Antennas, passes: int) -> None:
@@ -141,30 +158,31 @@ class SelfCalibration:
         self._elements = np.hstack([sends, receives]) if passes == 2 else receives
         self._amplitudes = np.ones((len(sends), 1)) if passes == 2 else sends
         size = self._elements.shape[1]
-        self.gains = Belief.prior(size, GAIN_STD)
-        self.slopes = Belief.prior(size, (SLOPE_STD, SLOPE_STD))
-        self.common = np.zeros((2, MODES))
-        self._common_information = np.full((2, MODES), COMMON_STD**-2)
-        self.clock = np.zeros(2)
-        self._clock_covariance = np.diag(np.square(CLOCK_STD[2 - passes]))
-        self._time = np.nan
+        self.state = Hardware(
+            Belief.prior(size, GAIN_STD),
+            Belief.prior(size, (SLOPE_STD, SLOPE_STD)),
+            np.zeros((2, MODES)),
+            np.full((2, MODES), COMMON_STD**-2),
+            np.zeros(2),
+            np.diag(np.square(CLOCK_STD[2 - passes])),
+        )
         self._taken_out = (*self._known()[:-1], np.zeros(2))
 
     def _known(self) -> tuple[np.ndarray, ...]:
-        return self.gains.value, self.slopes.value, self.common, self.clock
+        return self.state.gains.value, self.state.slopes.value, self.state.common, self.state.clock
 
     # ---- samples
 
     def correct(self, cube: IFCube, time: float) -> IFCube:
         """The samples of a frame at `time` [s] without what is known of the hardware."""
-        elapsed = 0.0 if np.isnan(self._time) else time - self._time
-        self._time = time
-        self.gains = self.gains.later(DRIFT**2 * elapsed)
+        elapsed = 0.0 if np.isnan(self.state.time) else time - self.state.time
+        self.state.time = time
+        self.state.gains = self.state.gains.later(DRIFT**2 * elapsed)
         F = np.array([[1.0, elapsed], [0.0, 1.0]])
-        self.clock = F @ self.clock
-        walk = np.diag(np.square(CLOCK_DRIFT)) * (elapsed * (self._clock_covariance[1, 1] > 0))
-        self._clock_covariance = F @ self._clock_covariance @ F.T + walk
-        clock = self.clock if self._passes == 2 else np.zeros(2)
+        self.state.clock = F @ self.state.clock
+        walk = np.diag(np.square(CLOCK_DRIFT)) * (elapsed * (self.state.clock_covariance[1, 1] > 0))
+        self.state.clock_covariance = F @ self.state.clock_covariance @ F.T + walk
+        clock = self.state.clock if self._passes == 2 else np.zeros(2)
         self._taken_out = (*self._known()[:-1], clock)
         table = self._table(cube.waveform)
         out = np.empty_like(cube.samples)
@@ -179,7 +197,8 @@ class SelfCalibration:
         n = np.arange(w.num_samples) - (w.num_samples - 1) / 2
         modes = polynomials(n / (w.window_length / 2))
         gain, slope, common = (
-            v[0] + 1j * v[1] for v in (self.gains.value, self.slopes.value, self.common)
+            v[0] + 1j * v[1]
+            for v in (self.state.gains.value, self.state.slopes.value, self.state.common)
         )
         tone = 2 * np.pi * w.slope * self._taken_out[-1][0] * w.sample_interval * n
         shared = common @ modes + 1j * tone
@@ -195,15 +214,15 @@ class SelfCalibration:
     ) -> Change:
         """Take in the looks of a frame and what clutter shows of neighbouring channels, and say how
         paths are seen otherwise from now on."""
-        before, clock = self.gains.value[1], self.clock
+        before, clock = self.state.gains.value[1], self.state.clock
         for look, sight in seen:
             self.learn(look, sight)
         if neighbours is not None:
             self._learn_of_neighbours(neighbours)
-        change = self.gains.value[1] - before
+        change = self.state.gains.value[1] - before
         _, across = self._steering(Sight(np.zeros(2), np.inf, FREE))
         lines = np.linalg.pinv(np.hstack([self._amplitudes, across]))[-2:] @ self._elements
-        delay, rate = self.clock - clock
+        delay, rate = self.state.clock - clock
         spread = np.sqrt(np.mean(change**2) * (lines**2).sum(axis=1))
         return Change(delay, rate, lines @ change, spread)
 
@@ -223,7 +242,7 @@ class SelfCalibration:
         if fitted.misfit > MISFIT:
             noise *= fitted.misfit
             fitted = self._fit(modes[0], noise, across, sight.direction_std)
-        self.gains = fitted.gains
+        self.state.gains = fitted.gains
         weight = 2 * np.abs(fitted.wave) ** 2 / noise
         left = modes[1:] / fitted.wave - (common[0] + 1j * common[1])[1:, None]
         left[0] -= self._elements @ (slopes[0] + 1j * slopes[1])
@@ -260,7 +279,7 @@ class SelfCalibration:
         Newton."""
         E, B, K = self._elements, self._amplitudes, self._elements.shape[1]
         X = np.hstack([E, B]), np.hstack([E, B, across])
-        priors = [_padded(self.gains.information[i], X[i].shape[1]) for i in (0, 1)]
+        priors = [_padded(self.state.gains.information[i], X[i].shape[1]) for i in (0, 1)]
         priors[1][-2:, -2:] = np.eye(2) / direction_std**2
         at = [np.zeros(x.shape[1]) for x in X]
         wave = heard
@@ -279,7 +298,7 @@ class SelfCalibration:
         for i, part in enumerate((left.real, left.imag)):
             cost += float(weight @ part**2 + at[i] @ priors[i] @ at[i])
             after.append(_marginal(priors[i] + (X[i].T * weight) @ X[i], K))
-        value = self.gains.value + np.stack([a[:K] for a in at])
+        value = self.state.gains.value + np.stack([a[:K] for a in at])
         misfit = cost / (2 * max(len(heard) - B.shape[1], 1))
         return _Fitted(Belief(value, np.stack(after)), wave, misfit)
 
@@ -290,31 +309,31 @@ class SelfCalibration:
         X = np.hstack([self._elements, self._amplitudes])
         steps, after = [], []
         for i, part in enumerate((left[0].real, left[0].imag)):
-            full = _padded(self.slopes.information[i], X.shape[1]) + (X.T * weight) @ X
+            full = _padded(self.state.slopes.information[i], X.shape[1]) + (X.T * weight) @ X
             steps.append(np.linalg.solve(full, X.T @ (weight * part))[:K])
             after.append(_marginal(full, K))
-        self.slopes = Belief(self.slopes.value + np.stack(steps), np.stack(after))
+        self.state.slopes = Belief(self.state.slopes.value + np.stack(steps), np.stack(after))
         own = np.stack([left[0] - self._elements @ (steps[0] + 1j * steps[1]), *left[1:]])
         mean = own @ weight / weight.sum()
         seen = np.array(
             [[0, 1, 1, 1], [0, 0, 1, 1]]
         )  # a common imaginary slope is the path's delay
         new = np.stack([np.append(0, mean.real), np.append(0, mean.imag)]) * seen
-        information = self._common_information + seen * weight.sum()
-        self.common = self.common + new * (seen * weight.sum() / information)
-        self._common_information = information
+        information = self.state.common_information + seen * weight.sum()
+        self.state.common = self.state.common + new * (seen * weight.sum() / information)
+        self.state.common_information = information
 
     def _learn_of_neighbours(self, seen: Neighbours) -> None:
         """Phases between channels, of which the frame's samples still hold what it has learnt."""
         X = self._elements[seen.second] - self._elements[seen.first]
-        left = seen.phase - X @ (self.gains.value[1] - self._taken_out[0][1])
+        left = seen.phase - X @ (self.state.gains.value[1] - self._taken_out[0][1])
         left = np.angle(np.exp(1j * left))
         weight = 1 / (np.maximum(seen.std, LEAST_PHASE) ** 2 + MESH_PHASE**2)
-        own = self.gains.information
+        own = self.state.gains.information
         full = own[1] + (X.T * weight) @ X
         step = np.linalg.solve(full, X.T @ (weight * left))
-        value = self.gains.value + np.stack([0 * step, step])
-        self.gains = Belief(value, np.stack([own[0], full]))
+        value = self.state.gains.value + np.stack([0 * step, step])
+        self.state.gains = Belief(value, np.stack([own[0], full]))
 
     def _learn_clock(self, look: Look, sight: Sight, learnt: np.ndarray) -> None:
         """By how much the path comes late, of which the frame's samples still hold what it has
@@ -324,33 +343,14 @@ class SelfCalibration:
         delay, rate, *std = sight.path
         left = np.array([look.delay - delay, look.delay_rate - rate]) - learnt
         best = CELLS * np.array([self.waveform.delay_step, self._rate_cell])
-        P = self._clock_covariance
+        P = self.state.clock_covariance
         gain = P @ np.linalg.inv(P + np.diag(np.square(std) + best**2))
-        self.clock = self.clock + gain @ left
-        self._clock_covariance = P - gain @ P
+        self.state.clock = self.state.clock + gain @ left
+        self.state.clock_covariance = P - gain @ P
 
     @property
     def _rate_cell(self) -> float:
         return self.waveform.velocity_cell(1) / SPEED_OF_LIGHT
-
-    # ---- state
-
-    def memory(self) -> dict[str, Any]:
-        """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
-        return {
-            "gains": [self.gains.value, self.gains.information],
-            "slopes": [self.slopes.value, self.slopes.information],
-            "common": [self.common, self._common_information],
-            "clock": [self.clock, self._clock_covariance],
-            "time": self._time,
-        }
-
-    def restore(self, memory: dict[str, Any]) -> None:
-        """Go on from a `memory`."""
-        self.gains, self.slopes = Belief(*memory["gains"]), Belief(*memory["slopes"])
-        self.common, self._common_information = memory["common"]
-        self.clock, self._clock_covariance = memory["clock"]
-        self._time = memory["time"]
 
 
 def calibration_of(

@@ -10,13 +10,16 @@ what stands far out of its neighbours is a body, and no neighbour of what is far
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.waveform import Waveform
+from isac_rt.plain import Stateful
 from isac_rt.receive.types import Detections
 from isac_rt.terminal.ghosts import Walls
-from isac_rt.terminal.tracker import Track
+from isac_rt.terminal.tracker import Track, Tracker
 from isac_rt.world.swarm import Pose
 
 STILL_MPS = 0.5
@@ -41,7 +44,14 @@ STANDS_OUT = 10.0
 """An echo weaker than another by more than this factor is not of the same surface."""
 
 
-class Standing:
+@dataclass
+class Seen:
+    """Echoes that stood still lately: (n, 5) times, places and signal-to-noise ratios."""
+
+    echoes: np.ndarray = field(default_factory=lambda: np.zeros((0, 5)))
+
+
+class Standing(Stateful):
     """Where echoes stood still that nothing explains.
 
     Parameters
@@ -52,7 +62,7 @@ class Standing:
 
     def __init__(self, turn: float, walls: Walls | None = None) -> None:
         self._walls = walls
-        self._seen = np.zeros((0, 5))
+        self.state = Seen()
         steps = (0, -1, 1) if np.isfinite(turn) else (0,)
         by = [step * turn if step else 0.0 for step in steps]
         self._aliases = np.array([(x, z) for x in by for z in by])
@@ -63,14 +73,6 @@ class Standing:
     ) -> Standing:
         """For the array of an active terminal (passes = 2) or a passive one."""
         return cls(antennas.turn(waveform.wavelength, passes), walls)
-
-    def memory(self) -> np.ndarray:
-        """(n, 5) times, places and signal-to-noise ratios, for `restore`."""
-        return self._seen
-
-    def restore(self, memory: np.ndarray) -> None:
-        """Go on from a `memory`."""
-        self._seen = memory
 
     def look(
         self,
@@ -110,7 +112,9 @@ class Standing:
         on = self._on_face(place, spread, still)
         new = np.column_stack([np.full(len(d), time), place, d.snr])
         new = new[still & d.starts & ~d.is_reference]
-        self._seen = np.concatenate([self._seen[self._seen[:, 0] > time - MEMORY_S], new])
+        self.state.echoes = np.concatenate(
+            [self.state.echoes[self.state.echoes[:, 0] > time - MEMORY_S], new]
+        )
         return on | still & self.crowded(place, d.snr)
 
     def _on_face(self, places: np.ndarray, spread: np.ndarray, asked: np.ndarray) -> np.ndarray:
@@ -130,11 +134,11 @@ class Standing:
         """(n,) whether what is seen at places (n, 3), so far above the noise (n,), lies among
         echoes that stood still, and does not stand out of them. What touches the mesh does not:
         the foot of a wall shines too."""
-        apart = np.linalg.norm(places[:, None] - self._seen[None, :, 1:4], axis=-1)
+        apart = np.linalg.norm(places[:, None] - self.state.echoes[None, :, 1:4], axis=-1)
         beside = (apart > BESIDE_M[0]) & (apart < BESIDE_M[1])
-        beside &= self._seen[:, 4] < STANDS_OUT * snr[:, None]
+        beside &= self.state.echoes[:, 4] < STANDS_OUT * snr[:, None]
         some = self._among(beside)
-        out = some & ~self._among(beside & (STANDS_OUT * self._seen[:, 4] > snr[:, None]))
+        out = some & ~self._among(beside & (STANDS_OUT * self.state.echoes[:, 4] > snr[:, None]))
         if self._walls is not None:
             out[out] = [not self._walls.within(place, BESIDE_M[0]) for place in places[out]]
         return some & ~out
@@ -142,15 +146,16 @@ class Standing:
     def _among(self, beside: np.ndarray) -> np.ndarray:
         """(n,) whether what is seen beside each (n, S) makes a crowd."""
         some = beside.sum(axis=1) >= CROWD
-        some[some] = [_spots(self._seen[near, 1:4]) >= CROWD for near in beside[some]]
+        some[some] = [_spots(self.state.echoes[near, 1:4]) >= CROWD for near in beside[some]]
         return some
 
-    def without(self, tracks: list[Track], new: set[int], crowd: np.ndarray) -> list[Track]:
-        """Tracks but those that stand still within a crowd or on a face, and those among `new`, not
+    def prune(self, tracker: Tracker, new: set[int], crowd: np.ndarray) -> None:
+        """End the tracks that stand still within a crowd or on a face, and those among `new`, not
         confirmed before, that an echo (Q,) of either carries on: from beyond the view and along a
         wall they seem to move."""
+        tracks = tracker.tracks
         part = {t.id for t in tracks if t.detection >= 0 and crowd[t.detection]} & new
-        return [t for t in tracks if not (self.holds(t) or t.id in part)]
+        tracker.drop(part | {t.id for t in tracks if self.holds(t)})
 
     def holds(self, track: Track) -> bool:
         """Whether a track stands still, as far as is known of it, within a crowd or on a face, or

@@ -20,6 +20,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, RangeProfiles
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.plain import plain, restored
 from isac_rt.receive.active import ActiveReceiver
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.settings import Receivers
@@ -187,7 +188,7 @@ class ActiveTerminal:
             found = replace(found, starts=found.starts & ~crowd)
             self.tracker.update(found, own_pose)
             self._doubts.remove_ghosts(self.tracker, new, own_pose, None, [b.state for b in told])
-            self.tracker.tracks = self._standing.without(self.tracker.tracks, new, crowd)
+            self._standing.prune(self.tracker, new, crowd)
         tracks = self.tracker.snapshot(own_pose)
         if self.calibration is not None:
             seen = echoes(reception.looks, self.calibration.waveform, own_pose, mates, tracks)
@@ -346,7 +347,7 @@ class PassiveTerminal:
         self._awaits_word = sender is not None
         if sender is not None:
             word = Track.of_body(of_itself(sender), self._acceleration, self._time)
-            over_another = self._retrospect is not None and self._retrospect.path is not None
+            over_another = self._retrospect is not None and self._retrospect.state.path is not None
             self._word = word if self._read or over_another else None
             self._teller = word if over_another else None
         self._clutter = self._expected_clutter(own_pose)
@@ -423,10 +424,10 @@ class PassiveTerminal:
         """Whether the path that is read over is as long, and changes as fast, as a way from the
         transmitter over the city's walls or about an edge."""
         walls = self._surroundings.walls
-        if walls is None or self._teller is None or kept.path is None:
+        if walls is None or self._teller is None or kept.state.path is None:
             return False
         there = self._teller.state.mean
-        length = kept.path.mean[:2] - SPEED_OF_LIGHT * np.array(self._clock)
+        length = kept.state.path.mean[:2] - SPEED_OF_LIGHT * np.array(self._clock)
         straight = measure(there, own)[None, :2]
         ways = sender_images(there[:6], own, walls, float(length[0]) + 1)
         apart = np.abs(np.concatenate([straight, ways]) - length)
@@ -462,7 +463,7 @@ class PassiveTerminal:
             for track in self.tracker.tracks:
                 track.confirmed &= track.age >= WORD_FRAMES
         self._doubts.remove_ghosts(self.tracker, new, own, reference, [b.state for b in told])
-        self.tracker.tracks = self._standing.without(self.tracker.tracks, new, crowd)
+        self._standing.prune(self.tracker, new, crowd)
 
     def _placed(self, sender: Gaussian) -> bool:
         """Whether the transmitter's motion is known to a Doppler bin: what is expected of the city
@@ -486,7 +487,7 @@ class PassiveTerminal:
             "tracker": self.tracker.memory(),
             "time": self._time,
             "state": int(self.state),
-            "reference": None if self.reference is None else self.reference.memory(),
+            "reference": plain(self.reference),
             "slips_repaired": self.slips_repaired,
             "ends": list(self._ends),
             "read": self._read,
@@ -500,7 +501,7 @@ class PassiveTerminal:
         self.tracker.restore(memory["tracker"])
         self._standing.restore(memory["standing"])
         reference = memory["reference"]
-        self.reference = None if reference is None else Track.of_memory(reference)
+        self.reference = restored(Track | None, reference)
         self._time, self.state = memory["time"], TerminalState(memory["state"])
         self.slips_repaired = memory["slips_repaired"]
         self._read = memory["read"]
@@ -530,7 +531,7 @@ class PassiveTerminal:
     @property
     def _clock(self) -> np.ndarray:
         """Delay [s] and rate by which all paths are heard late, as far as that is known."""
-        return np.zeros(2) if self.calibration is None else self.calibration.clock
+        return np.zeros(2) if self.calibration is None else self.calibration.state.clock
 
     def _late(self, what: Detections | Prediction, sign: int) -> Any:
         """What has been found or is expected, by so much later (1) or sooner (-1)."""

@@ -7,13 +7,13 @@ outside, symbols inside: x, P mean and covariance; F, Q, H, R the model.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from isac_rt.plain import Stateful
 from isac_rt.receive.types import Detections, Prediction
 from isac_rt.terminal.filter import (
     Ambiguity,
@@ -107,16 +107,6 @@ class Track:
         covariance = np.diag([0.0] * 6 + [acceleration_std**2] * 3)
         covariance[:6, :6] = body.covariance
         return cls(-1, Gaussian(mean, covariance), np.inf, confirmed=True, last=time)
-
-    def memory(self) -> dict[str, Any]:
-        """The track as plain numbers and arrays, for `of_memory`."""
-        return {**vars(self), "state": list(self.state)}
-
-    @classmethod
-    def of_memory(cls, memory: dict[str, Any]) -> Track:
-        """The track that gave a `memory`."""
-        mean, covariance = memory["state"]
-        return cls(**{**memory, "state": Gaussian(mean, covariance)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,7 +204,16 @@ def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None
     )
 
 
-class Tracker:
+@dataclass
+class Followed:
+    """What a tracker carries over: its tracks at a time [s], and the number of the next one."""
+
+    tracks: list[Track] = field(default_factory=list)
+    time: float = -np.inf
+    next_id: int = 0
+
+
+class Tracker(Stateful):
     """All tracks of one terminal but a PT's reference: prediction, association, birth, confirmation
     and death.
 
@@ -227,37 +226,34 @@ class Tracker:
     def __init__(self, settings: Tracking, ambiguity: Ambiguity) -> None:
         self.settings = settings
         self.ambiguity = ambiguity
-        self.tracks: list[Track] = []
-        self.time = -np.inf
-        self._next_id = 0
+        self.state = Followed()
+
+    @property
+    def tracks(self) -> list[Track]:
+        """All of them, tentative ones included, oldest first."""
+        return self.state.tracks
 
     def new_id(self) -> int:
         """Numbers in order of birth."""
-        self._next_id += 1
-        return self._next_id - 1
+        self.state.next_id += 1
+        return self.state.next_id - 1
 
     def clear(self) -> None:
         """Forget all tracks (their numbers stay used)."""
-        self.tracks = []
+        self.state.tracks = []
 
-    def memory(self) -> dict[str, Any]:
-        """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
-        tracks = [track.memory() for track in self.tracks]
-        return {"time": self.time, "next_id": self._next_id, "tracks": tracks}
-
-    def restore(self, memory: dict[str, Any]) -> None:
-        """Go on from a `memory`."""
-        self.time, self._next_id = memory["time"], memory["next_id"]
-        self.tracks = [Track.of_memory(track) for track in memory["tracks"]]
+    def drop(self, ids: Container[int]) -> None:
+        """End some tracks."""
+        self.state.tracks = [t for t in self.tracks if t.id not in ids]
 
     def predict(self, time: float) -> None:
         """Bring all tracks to `time` [s]."""
         for track in self.tracks:
             track.state = predict(
-                track.state, time - self.time, self.settings.acceleration_std_mps2
+                track.state, time - self.state.time, self.settings.acceleration_std_mps2
             )
             track.detection = -1
-        self.time = time
+        self.state.time = time
 
     def update(
         self, detections: Detections, own: Pose, transmitter: Gaussian | None = None
@@ -287,10 +283,10 @@ class Tracker:
                 t = None if transmitter is None else transmitter.mean
                 track.state = update(track.state, z[q], R, own, t, ambiguity=self.ambiguity)
                 track.snr, track.detection = float(detections.snr[q]), q
-                track.last = self.time
-        self.tracks = [t for t in self.tracks if not self._dead(t)]
+                track.last = self.state.time
+        self.state.tracks = [t for t in self.tracks if not self._dead(t)]
         if self.settings.births == "unexplained":
-            self.tracks = united(self.tracks)
+            self.state.tracks = united(self.tracks)
         for q in (q for q in free if detections.starts[q]):
             state = birth(
                 z[q],
@@ -302,7 +298,7 @@ class Tracker:
             )
             if state is not None:
                 track = Track(self.new_id(), state, float(detections.snr[q]), detection=q)
-                track.last = self.time
+                track.last = self.state.time
                 track.confirmed = self.settings.confirm_hits == 1
                 self.tracks.append(track)
 
@@ -353,7 +349,8 @@ class Tracker:
         s = self.settings
         if track.confirmed:
             late = s.drop_after_s is not None and (
-                self.time - track.last > s.drop_after_s - ROUNDING or 2 * track.missed > track.age
+                self.state.time - track.last > s.drop_after_s - ROUNDING
+                or 2 * track.missed > track.age
             )
             return late or track.missed >= s.drop_misses
         return sum(track.recent) + s.confirm_window - len(track.recent) < s.confirm_hits

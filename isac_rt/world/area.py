@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from isac_rt.plain import plain, restored
 from isac_rt.settings import plain_tree
 from isac_rt.storage import kept
 from isac_rt.world import settings
@@ -55,12 +56,13 @@ def _loaded_city(
         _LOG.info("reading the city")
     if not digest:  # made from numbers, in less time than it is read
         return load_city(tree, folder, carrier, centre)
-    return CityMesh.of_plain(
+    return restored(
+        CityMesh,
         kept(
             "city",
             [text, digest, carrier, centre],
-            lambda: load_city(tree, folder, carrier, centre).plain(),
-        )
+            lambda: plain(load_city(tree, folder, carrier, centre)),
+        ),
     )
 
 

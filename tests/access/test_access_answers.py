@@ -16,6 +16,7 @@ from isac_rt.access.synchronise import EXTERNAL, ClockEstimate, round_of
 from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
+from isac_rt.plain import plain, restored
 from isac_rt.receive.types import Detections, Reception, no_detections
 from isac_rt.terminal.filter import Gaussian
 from isac_rt.terminal.tracker import Track, TrackSet, track_set
@@ -221,7 +222,7 @@ def test_advice_acts_on_its_transmitter_and_comes_back_from_memory():
     one = Schedules(usual, 3)
     one.take_advice(receptions)
     again = Schedules(usual, 3)
-    again.restore(one.memory())
+    again.advice = restored(dict[Link, bool], plain(one.advice))
     for s in (one, again):
         assert s.of("A") is usual
         assert np.array_equal(s.of("B"), conventional_schedule(1, 12, 3))

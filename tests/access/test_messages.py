@@ -19,6 +19,7 @@ from isac_rt.access.messages import (
     Notes,
     Sightings,
 )
+from isac_rt.plain import plain
 from isac_rt.storage import pack, unpack
 from isac_rt.terminal.filter import Ambiguity, Gaussian
 from isac_rt.terminal.fusion import DATUM_STD, ERRORS, Key, Told
@@ -90,8 +91,8 @@ def test_a_message_comes_late_with_the_last_of_its_frames_that_is_read():
     for frame in (15, 16):
         channel.send(message(2))
         assert channel.carry(frame, 2000, True)[1]
-        waits = channel.memory()[3]
-        assert [missed for _, missed in waits] == ([[8]] if frame == 15 else [])
+        missed = [frames for _, frames in channel.waiting]
+        assert missed == ([{8}] if frame == 15 else [])
 
 
 def test_tracks_take_turns_where_a_frame_cannot_hold_all():
@@ -194,7 +195,7 @@ def test_a_terminal_that_stops_in_mid_sentence_goes_on_with_it():
         said = [n.compose("X", 2000) for n in (one, two)] + [
             n.compose("B", 900) for n in (one, two)
         ]
-        packed = [pack(m.memory()) for m in said]
+        packed = [pack(plain(m)) for m in said]
         assert packed[0] == packed[1] and packed[2] == packed[3]
         assert said[0].reports and said[2].reports
         pictures = [

@@ -267,14 +267,14 @@ def test_a_path_is_found_again_within_what_was_predicted_of_it():
         receiver = terminal(5.0)
         play(receiver, cubes[:4])
         kept = receiver._retrospect
-        path, off = kept.path, 0.53 * cell
+        path, off = kept.state.path, 0.53 * cell
         mean = path.mean + np.array([0.0, off, 0.0])
         covariance = np.diag([1e-3, (std * cell) ** 2, 1e-2])
-        kept.path = replace(path, mean=mean, covariance=covariance)
+        kept.state.path = replace(path, mean=mean, covariance=covariance)
         heard = play(receiver, cubes[4:], 4)
         assert heard[4, 4].decoded and not heard[4, 4].line_of_sight
         now = RATE + BEND * 4 * INTERVAL
-        left = (kept.path.mean[1] - now) / cell
+        left = (kept.state.path.mean[1] - now) / cell
         assert (abs(left) < 0.1) if back else (0.45 < left < 0.6)
 
 

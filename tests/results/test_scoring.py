@@ -289,7 +289,7 @@ def test_tracks_are_judged_by_what_feeds_them():
     assert first.kind.tolist() == [PathKind.TARGET, PathKind.DIFFUSE, PathKind.TARGET]
     assert first.target.tolist() == [0, -1, 0]
     assert step(DATA + 1, (-1, -1), []).uav.tolist() == [-1, 0]
-    assert [label[0] for label in judge.memory()["labels"]] == [4, 9]
+    assert list(judge.state.labels) == [4, 9]
     again = scorer("AT")
     again.restore(judge.memory())
     judge = again

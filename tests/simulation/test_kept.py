@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from isac_rt import load, runtime
+from isac_rt.plain import plain
 from isac_rt.propagation import raytrace
 from isac_rt.propagation.clutter import field as clutter_field
 from isac_rt.propagation.clutter import sight
@@ -78,7 +79,7 @@ def prepared(folder: Path, change: dict) -> bytes:
         for link in field.merged
         for name in link
     ]
-    tree, arrays = pack([setup.city.plain(), setup.city.plane_of_face, cells, shares])
+    tree, arrays = pack([plain(setup.city), setup.city.plane_of_face, cells, shares])
     return tree.encode() + arrays
 
 

@@ -189,9 +189,9 @@ def test_everything_that_is_carried_over_is_taken_up(tmp_path):
         for observer in one.observers.values():
             for part in (observer, observer.terminal):
                 counted(part)
-            counted(observer.terminal.tracker)
-            observer.scorer._labels |= {70: [1, 2], 71: [0]}
-            observer.scorer._followed |= {5: 70}
+            counted(observer.terminal.tracker.state)
+            observer.scorer.state.labels |= {70: [1, 2], 71: [0]}
+            observer.scorer.state.followed |= {5: 70}
     assert resume.append(first.memory([{}, {}]))
     assert second.restore(resume) == 4
     first.kept = second.kept

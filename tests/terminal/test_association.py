@@ -213,7 +213,7 @@ def test_the_association_is_the_likeliest_of_all(bistatic):
             Tracker(Tracking(gate_probability=GATE), Ambiguity(PERIOD)),
             [t.state for t in tracks],
         )
-        tracker.tracks = list(tracks)
+        tracker.state.tracks = list(tracks)
         tracker.update(marked(z, std), OWN, sender)
         hit = {t.id: int(t.snr) - 100 for t in tracks if t.missed == 0}
         assert hit == expected
@@ -240,7 +240,7 @@ def test_the_gate_is_the_quantile_of_what_was_measured(freedom):
     one = 1 / np.sqrt(np.linalg.inv(S)[0, 0])
     for share, taken in ((0.99, True), (1.01, False)):
         tracker = Tracker(Tracking(gate_probability=GATE), Ambiguity(PERIOD))
-        tracker.tracks = [Track(0, Gaussian(np.append(FAR, np.zeros(3)), P), 1.0)]
+        tracker.state.tracks = [Track(0, Gaussian(np.append(FAR, np.zeros(3)), P), 1.0)]
         z = np.array(mean, float)
         z[0] += share * np.sqrt(gate(freedom)) * one
         z[freedom:] = np.nan

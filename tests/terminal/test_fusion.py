@@ -220,9 +220,9 @@ def test_a_name_goes_back_to_the_body_with_its_track(order):
     own track, by which the third is known meanwhile. That one had it too before."""
     a, b, c = Key("S->A", 1), Key("S->B", 1), Key("S->C", 1)
     known = {a: Name(0.0, *a), b: Name(0.0, *a), c: Name(1.0, *b)}
+    bodies = [{"name": list(known[key]), "members": [list(key)]} for key in (a, b, c)]
     picture = Picture()
-    bodies = [[list(known[key]), [list(key)]] for key in (a, b, c)]
-    picture.restore([bodies[i] for i in order])
+    picture.restore({"state": {"bodies": [bodies[i] for i in order]}})
     reports = [
         told(key, [50.0 * i, 0, 0, 0, 0, 0], [0.1] * 6, since=float(i), name=known[key])
         for i, key in enumerate((a, b, c))

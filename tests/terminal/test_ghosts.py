@@ -177,7 +177,7 @@ def test_a_confirmed_echo_ends_once_its_body_is_known_three_frames():
     body = [Gaussian(np.concatenate([BODY[:3] + ORIGIN, BODY[3:]]), np.eye(6) * 1e-4)]
     for told, left in (((body,) * 3, 0), ((body, body, [], body, body), 1)):
         tracker = Tracker(Tracking(), Ambiguity(PERIOD))
-        tracker.tracks = [track(5, image, BODY[3:] * [-1, 1, 1])]
+        tracker.state.tracks = [track(5, image, BODY[3:] * [-1, 1, 1])]
         for known in told:
             assert len(tracker.tracks) == 1
             doubts.remove_ghosts(tracker, set(), OWN, told=known)
@@ -197,7 +197,7 @@ def test_a_confirmed_track_that_goes_behind_a_wall_ends(depth, std, frames):
     doubts, tracker = Doubts(Walls(wall()), antennas, w), Tracker(Tracking(), Ambiguity(PERIOD))
     one = track(5, np.array([WALL_X + depth, 24.0, 5.0]), np.zeros(3))
     one.state = Gaussian(one.state.mean, np.diag([std**2] * 3 + [1e-2] * 3))
-    tracker.tracks = [one]
+    tracker.state.tracks = [one]
     ended = None
     for frame in range(1, 5):
         doubts.remove_ghosts(tracker, set(), OWN)

@@ -103,7 +103,7 @@ def passive(answers=(), state: Gaussian | None = None, **settings) -> tuple[Pass
     vars(pt)["receive"] = told  # in place of the method
     if state is not None:
         pt.reference = Track(pt.tracker.new_id(), state, 80.0, confirmed=True)
-        pt.state, pt._time, pt.tracker.time = TerminalState.TRACKING, -1e-6, -1e-6
+        pt.state, pt._time, pt.tracker.state.time = TerminalState.TRACKING, -1e-6, -1e-6
     return pt, told
 
 
@@ -124,7 +124,7 @@ def test_a_prediction_is_what_its_samples_measure():
     )
     states = [Gaussian(SENDER, root @ root.T), Gaussian(BODY, 2.3 * root @ root.T)]
     pt, told = passive([heard()], states[0])
-    pt.tracker.tracks = [
+    pt.tracker.state.tracks = [
         Track(5, states[1], 20.0, confirmed=True),
         Track(6, Gaussian(BODY + 3, root @ root.T), 30.0, confirmed=False),
         Track(7, Gaussian(BODY - 3, root @ root.T), 30.0, confirmed=True, missed=1),
@@ -154,7 +154,7 @@ def test_a_prediction_is_what_its_samples_measure():
 def test_the_strongest_of_all_weighs_one():
     """A reflector above the line of sight. Planted bug: weights over the reference's."""
     pt, told = passive([heard()], known())
-    pt.tracker.tracks = [Track(5, Gaussian(BODY, known().covariance), 320.0, confirmed=True)]
+    pt.tracker.state.tracks = [Track(5, Gaussian(BODY, known().covariance), 320.0, confirmed=True)]
     pt.step(EMPTY, OWN, 0.01, True)
     assert told.handed[0][0].weight == pytest.approx([0.25, 1.0])
 
@@ -166,7 +166,7 @@ def test_what_is_reported_has_the_deviations_of_its_state():
     own = replace(OWN, velocity=np.array([1.3, -4.1, 0.7]))
     pt, _ = passive([heard()], known(0.3, 0.7))
     body = Gaussian(BODY, 1.7 * known(0.5, 0.9).covariance)
-    pt.tracker.tracks = [Track(5, body, 20.0, confirmed=True)]
+    pt.tracker.state.tracks = [Track(5, body, 20.0, confirmed=True)]
     tracks = pt.tracker.snapshot(own, pt.reference)
     H = slopes(lambda s: what_is_measured(s, own, SENDER), BODY).astype(float)
     J = slopes(lambda s: what_is_measured(BODY, own, s), SENDER).astype(float)
@@ -291,7 +291,7 @@ def test_a_pilot_in_another_cell_starts_anew(cells, modulated, anew):
     number, and what rested on the old one is gone. Planted bugs: data frames start anew; metres for
     cells; the other tracks kept."""
     pt, _ = passive([heard(sight() + np.array([cells * CELL, 0, 0, 0]))], known())
-    pt.tracker.tracks = [
+    pt.tracker.state.tracks = [
         Track(pt.tracker.new_id(), Gaussian(BODY, known().covariance), 20.0, confirmed=True)
     ]
     _, tracks = pt.step(EMPTY, OWN, 0.0, modulated)
@@ -436,8 +436,8 @@ def test_an_active_terminal_hands_its_clutter_on_and_folds_its_echoes():
     told = Told([heard(None, [z + whole * fold]) for whole in (0, -1, 2)])
     vars(at)["receive"] = told  # in place of the method
     state = Gaussian(BODY.copy(), known(0.02, 0.2).covariance)
-    at.tracker.tracks = [Track(at.tracker.new_id(), state, 20.0)]
-    at.tracker.time = -1e-6
+    at.tracker.state.tracks = [Track(at.tracker.new_id(), state, 20.0)]
+    at.tracker.state.time = -1e-6
     payload: Any = object()
     for k in range(3):
         _, tracks = at.step(EMPTY, payload, OWN, 1e-6 * k, clutter=clutter, maps=k == 1)

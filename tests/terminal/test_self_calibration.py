@@ -84,7 +84,7 @@ def look(values: np.ndarray, delay: float = 1e-7, rate: float = 0.0) -> Look:
 
 def gains_of(one: SelfCalibration, passes: int) -> np.ndarray:
     """(L_tx, L_rx) what samples are divided by."""
-    each = np.exp(one.gains.value[0] + 1j * one.gains.value[1])
+    each = np.exp(one.state.gains.value[0] + 1j * one.state.gains.value[1])
     return each[:3, None] * each[3:] if passes == 2 else np.ones((3, 1)) * each
 
 
@@ -168,7 +168,7 @@ def test_clutter_shows_phases_of_neighbours_however_wide_its_directions():
         assert seen.std.max() < 0.1
         assert np.sqrt(np.mean((off / seen.std) ** 2)) < 1.5
         one.learn_all([], seen)
-    left = np.angle(g * np.exp(-1j * one._elements @ one.gains.value[1]))
+    left = np.angle(g * np.exp(-1j * one._elements @ one.state.gains.value[1]))
     left = np.angle(np.exp(1j * (left - np.angle(np.exp(1j * left).sum()))))
     lines = np.hstack([np.ones((45, 1)), wave * places[:, [0, 2]]])
     line = np.linalg.lstsq(lines, left, rcond=None)[0]
@@ -194,10 +194,10 @@ def test_clutter_in_hardly_a_cell_says_nothing_of_phases(rows):
     seen = phases(maps, expected, 2.0, known, clutter)
     assert np.isinf(seen.std).all()
     one = SelfCalibration(W, ANTENNAS, 2)
-    before = one.gains
+    before = one.state.gains
     one.learn_all([], seen)
-    assert np.array_equal(one.gains.value, before.value)
-    assert np.array_equal(one.gains.information, before.information)
+    assert np.array_equal(one.state.gains.value, before.value)
+    assert np.array_equal(one.state.gains.information, before.information)
 
 
 def bent(values: np.ndarray, rng, schedule: np.ndarray) -> np.ndarray:
@@ -240,7 +240,7 @@ def test_samples_are_corrected_to_those_of_ideal_hardware():
     a, b = found[..., inside].ravel(), truth.samples[..., inside].ravel()
     factor = np.vdot(b, a) / np.vdot(b, b)
     assert 10 * np.log10(np.mean(np.abs(a / factor - b) ** 2)) < -30
-    assert at.calibration.clock[0] == pytest.approx(0.456e-9, abs=0.02e-9)
+    assert at.calibration.state.clock[0] == pytest.approx(0.456e-9, abs=0.02e-9)
 
 
 def test_a_passive_terminal_finds_clock_and_gains_in_its_line_of_sight():
@@ -266,7 +266,7 @@ def test_a_passive_terminal_finds_clock_and_gains_in_its_line_of_sight():
         if modulated:
             assert (reception.delay_symbols == data.delay_symbols).mean() > 0.99
     assert pt.calibration is not None
-    assert pt.calibration.clock == pytest.approx([late, 2e-9], abs=2e-10)
+    assert pt.calibration.state.clock == pytest.approx([late, 2e-9], abs=2e-10)
     assert tracks.range[0] == pytest.approx(20.0, abs=0.05)
     assert tracks.velocity[0] == pytest.approx(0.0, abs=0.1)
     assert reception.detections.direction[0] == pytest.approx(u, abs=2e-3)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from isac_rt.receive.types import Detections
-from isac_rt.terminal.filter import Gaussian
+from isac_rt.terminal.filter import UNAMBIGUOUS, Gaussian
 from isac_rt.terminal.ghosts import Walls
+from isac_rt.terminal.settings import Tracking
 from isac_rt.terminal.standing import MEMORY_S, Standing
-from isac_rt.terminal.tracker import Track
+from isac_rt.terminal.tracker import Track, Tracker
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
@@ -147,7 +148,7 @@ def test_a_wall_stands_still_for_a_passive_terminal():
     d = Detections(**{**vars(d), "range": far[0] + far[1], "velocity": rate})
     standing = Standing(np.inf)
     assert standing.look(d, own(0.0), 0.0, PERIOD, sender).tolist() == [True] * 5 + [False]
-    np.testing.assert_allclose(standing.memory()[:, 1:4], WALL, atol=1e-9)
+    np.testing.assert_allclose(standing.state.echoes[:, 1:4], WALL, atol=1e-9)
 
 
 def test_a_young_track_that_an_echo_of_a_crowd_carries_on_is_none():
@@ -162,8 +163,10 @@ def test_a_young_track_that_an_echo_of_a_crowd_carries_on_is_none():
         )
 
     tracks = [track(1, 0), track(2, 0), track(3, 1), track(4, 0, confirmed=False), track(5, -1)]
-    kept = Standing(1.71).without(tracks, {1, 3, 4, 5}, np.array([True, False]))
-    assert [t.id for t in kept] == [2, 3, 5]
+    tracker = Tracker(Tracking(), UNAMBIGUOUS)
+    tracker.state.tracks = tracks
+    Standing(1.71).prune(tracker, {1, 3, 4, 5}, np.array([True, False]))
+    assert [t.id for t in tracker.tracks] == [2, 3, 5]
 
 
 def test_two_uavs_that_hover_near_each_other_are_no_crowd():
@@ -225,7 +228,7 @@ def test_a_line_of_sight_is_no_echo():
     standing.look(
         Detections(**{**vars(d), "is_reference": np.ones(5, bool)}), own(0.0), 0.0, PERIOD
     )
-    assert len(standing.memory()) == 0
+    assert len(standing.state.echoes) == 0
 
 
 def ground() -> Walls:
@@ -254,7 +257,7 @@ def test_what_stands_still_on_a_face_is_the_face(height, velocity, std, expected
     d = Detections(**{**vars(d), "std": np.array([[0.01, 0.01, std, std]])})
     assert standing.look(d, own(0.0), 0.0, PERIOD).tolist() == [expected]
     if expected:
-        assert len(standing.memory()) == 1
+        assert len(standing.state.echoes) == 1
 
 
 @pytest.mark.parametrize(

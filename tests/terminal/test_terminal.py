@@ -207,8 +207,8 @@ def test_the_active_terminal_expects_its_tracks_and_its_mates_where_they_are():
     mate = replace(own, position=np.array([0.0, 20.0, 0.0]), velocity=np.array([0.0, 3.0, 0.0]))
     body = Gaussian(np.array([0.0, 30.0, 0, 0, -4.0, 0, 0, 0, 0]), 0.01 * np.eye(9))
     still = Gaussian(np.array([0.0, 15.0, 0, 0, 0.1, 0, 0, 0, 0]), 0.01 * np.eye(9))
-    at.tracker.tracks = [Track(0, body, 10.0), Track(1, still, 10.0)]
-    at.tracker.time = 0.0
+    at.tracker.state.tracks = [Track(0, body, 10.0), Track(1, still, 10.0)]
+    at.tracker.state.time = 0.0
     at.tracker.predict(0.5)
     told = [KnownBody("PT", of_itself(mate)), KnownBody("", of_itself(own))]
     sought = at._sought(own, told)

@@ -43,6 +43,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.kernels.jit import jit
+from isac_rt.plain import plain
 from isac_rt.propagation.clutter.cells import MOST_CELLS, Cells, Density, cut, error_for
 from isac_rt.propagation.clutter.merging import Heard, NoiseFloor, covered, resolution_cell
 from isac_rt.propagation.clutter.penumbra import Facets
@@ -194,7 +195,7 @@ class ClutterField:
             cells = cut(city, scatters, places, density, seed, in_sight)
             return {"cells": vars(cells), "of": of}
 
-        depends_on = [city.plain(), places, lookouts, fronts, asdict(density), seed, MOST_CELLS]
+        depends_on = [plain(city), places, lookouts, fronts, asdict(density), seed, MOST_CELLS]
         had = kept("cells", [*depends_on, mi.variant()], found)
         cells = Cells(**had["cells"])
         sight = Sight(shadows, flights, facets_of(cells, city), wavelength, city)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -206,22 +206,6 @@ class CityMesh:
             "plane": (place and place.plane) or None,
             "notes": list(self.notes),
         }
-
-    def plain(self) -> dict[str, Any]:
-        """All of it as plain data and arrays, for `of_plain`."""
-        own = {field.name: getattr(self, field.name) for field in fields(self)}
-        place = None if self.place is None else asdict(self.place)
-        return own | {
-            "materials": [asdict(material) for material in self.materials],
-            "place": place,
-        }
-
-    @classmethod
-    def of_plain(cls, own: dict[str, Any]) -> CityMesh:
-        """The city that `plain` took apart."""
-        materials = tuple(Material(**material) for material in own["materials"])
-        place = own["place"] and Place(**own["place"] | {"origin": tuple(own["place"]["origin"])})
-        return cls(**own | {"materials": materials, "notes": tuple(own["notes"]), "place": place})
 
     def bounds(self) -> NDArray[np.float64]:
         """(2, 3) lowest and highest local coordinates; zeros for an empty city. [m]"""
