@@ -65,8 +65,8 @@ if TYPE_CHECKING:
     from isac_rt.sweep import open_sweep as open_sweep
     from isac_rt.sweep import run_dataset as run_dataset
     from isac_rt.sweep import run_sweep as run_sweep
-    from isac_rt.terminal.terminal import ActiveTerminal as ActiveTerminal
-    from isac_rt.terminal.terminal import PassiveTerminal as PassiveTerminal
+    from isac_rt.track.terminal import ActiveTerminal as ActiveTerminal
+    from isac_rt.track.terminal import PassiveTerminal as PassiveTerminal
     from isac_rt.views.animate import animate as animate
     from isac_rt.views.animate import write_animation as write_animation
     from isac_rt.views.interactive import scene_3d as scene_3d
@@ -95,7 +95,7 @@ _NAMES = {
     "simulation.setup": "Frame Setup city_of prepare trace",
     "simulation.simulate": "run standard_terminal",
     "sweep": "Samples load_dataset load_sweep open_sweep run_dataset run_sweep",
-    "terminal.terminal": "ActiveTerminal PassiveTerminal",
+    "track.terminal": "ActiveTerminal PassiveTerminal",
     "views.animate": "animate write_animation",
     "views.interactive": "scene_3d",
     "views.interchange": "from_sionna stonesoup_detections write_sigmf",

@@ -127,7 +127,7 @@ class Scenes:
 
     def __init__(self, scene: Scenario) -> None:
         from isac_rt.propagation.raytrace import RayTracer
-        from isac_rt.terminal.expectation import MeshExpectation
+        from isac_rt.track.expectation import MeshExpectation
 
         self.setup: Setup = prepare(scene)
         tracer, expectation = self.setup.propagation, self.setup.expectation

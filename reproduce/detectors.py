@@ -34,7 +34,7 @@ from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import ExpectedClutter, Hints
 from isac_rt.results.metrics import binomial_interval
-from isac_rt.terminal.expectation import Mistakes
+from isac_rt.track.expectation import Mistakes
 from reproduce.clutter_scenes import (
     PLACES,
     SPEED,

@@ -3,7 +3,7 @@ finds.
 
 An active terminal, a passive one and another UAV in a canyon whose facades and ground mirror; no
 diffuse clutter. The truth (`det_kind`, `det_order`, `det_face`, `track_uav`) says which tracks are
-ghosts; the test (`isac_rt.terminal.ghosts`) has the mesh, the terminal's own pose and its tracks.
+ghosts; the test (`isac_rt.track.ghosts`) has the mesh, the terminal's own pose and its tracks.
 At the passive terminal the line of sight over a wall, which shows the active terminal again, counts
 as a ghost too.
 """
@@ -26,9 +26,9 @@ from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import Setup, prepare
-from isac_rt.terminal.ghosts import Leeway, Suspicion, Walls, suspicion
-from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal
-from isac_rt.terminal.tracker import TrackSet
+from isac_rt.track.ghosts import Leeway, Suspicion, Walls, suspicion
+from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
+from isac_rt.track.tracker import TrackSet
 from isac_rt.world.swarm import Pose
 from reproduce import SCENES
 from reproduce.outcome import Outcome, Progress, Sentences, Verdict, proportion

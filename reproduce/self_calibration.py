@@ -20,7 +20,7 @@ from isac_rt.receive.modes import MODES
 from isac_rt.receive.types import Look
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
-from isac_rt.terminal.self_calibration import SelfCalibration, Sight
+from isac_rt.track.self_calibration import SelfCalibration, Sight
 from reproduce import SCENES
 from reproduce.outcome import Outcome, Progress, Sentences, Verdict, blank, style, table
 from reproduce.symbols import link_waveform, paper_antennas

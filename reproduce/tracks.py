@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from isac_rt.frame.antennas import azimuth_elevation
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.simulation.setup import swarm_of
-from isac_rt.terminal.filter import (
+from isac_rt.track.filter import (
     Ambiguity,
     birth,
     measure,

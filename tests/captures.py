@@ -20,9 +20,9 @@ from isac_rt.frame.payload import Payload
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Reception
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal
-from isac_rt.terminal.tracker import TrackSet
+from isac_rt.track.settings import Tracking
+from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
+from isac_rt.track.tracker import TrackSet
 from isac_rt.world.swarm import Pose
 
 POSE = ("position", "velocity", "acceleration", "rotation")

@@ -405,32 +405,32 @@ OF_CASES = {
         "rng.standard_normal((count, 2)) @ np.array([1, 1j])",
     ),
     "jacobians of the tracker": Bug(
-        "terminal/filter.py",
+        "track/filter.py",
         "turn = (np.eye(3) - np.outer(e, e)) / r",
         "turn = (np.eye(3) - np.outer(e, e))",
     ),
     "bistatic range": Bug(
-        "terminal/filter.py",
+        "track/filter.py",
         "(2 * (length - ahead))",
         "(2 * (length + ahead))",
     ),
     "covariance of an unknown acceleration": Bug(
-        "terminal/filter.py",
+        "track/filter.py",
         "density = 2 * acceleration_std**2",
         "density = acceleration_std**2",
     ),
     "consistency of states": Bug(
-        "terminal/filter.py",
+        "track/filter.py",
         "density = 2 * acceleration_std**2",
         "density = 0.02 * acceleration_std**2",
     ),
     "consistency of innovations": Bug(
-        "terminal/filter.py",
+        "track/filter.py",
         "P = A @ P @ A.T + K @ R @ K.T",
         "P = A @ P @ A.T / 4",
     ),
     "consistency in manoeuvres": Bug(
-        "terminal/filter.py",
+        "track/filter.py",
         "density * interval**5 *",
         "density * interval**6 *",
     ),
@@ -645,18 +645,16 @@ OF_TESTS = (
     ),
     (
         "test_association::test_the_association_is_the_likeliest_of_all",
-        Bug("terminal/filter.py", "out[k, q] = d2 + log_det", "out[k, q] = d2"),
+        Bug("track/filter.py", "out[k, q] = d2 + log_det", "out[k, q] = d2"),
     ),
     (
         "test_handover::test_a_prediction_is_what_its_samples_measure",
-        Bug(
-            "terminal/tracker.py", "velocity_std=report.std[:, 1]", "velocity_std=report.std[:, 0]"
-        ),
+        Bug("track/tracker.py", "velocity_std=report.std[:, 1]", "velocity_std=report.std[:, 0]"),
     ),
     (
         "test_ghost_images::test_reflections_are_the_images_that_each_end_sees",
         Bug(
-            "terminal/ghosts.py",
+            "track/ghosts.py",
             "*_images(body, start, walls, reach)",
             "*_images(body, here, walls, reach)",
         ),
@@ -700,7 +698,7 @@ OF_TESTS = (
     (
         "test_resume::test_everything_that_is_carried_over_is_taken_up",
         Bug(
-            "terminal/terminal.py",
+            "track/terminal.py",
             '"slips_repaired": self.slips_repaired,',
             '"slips_repaired": 0,',
         ),

@@ -16,7 +16,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # a room may import itself and those before it
 ORDER = (
     "runtime randomness storage plain registry settings document kernels world frame hardware "
-    "propagation signal receive terminal access scenario results capture simulation sweep views "
+    "propagation signal receive track access scenario results capture simulation sweep views "
     "cli"
 ).split()
 GROUND = {"runtime", "randomness"}

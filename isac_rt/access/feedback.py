@@ -18,7 +18,7 @@ from scipy.special import gammainccinv
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.symbols.powers import EXTRA_CELLS
 from isac_rt.receive.types import Reception
-from isac_rt.terminal.tracker import TrackSet
+from isac_rt.track.tracker import TrackSet
 
 LARGEST_SLIP = 16  # cells; what is farther off was never acquired
 CONFIDENT_RATE = 1e-3

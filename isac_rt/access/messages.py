@@ -15,8 +15,8 @@ from math import ceil
 import numpy as np
 
 from isac_rt.plain import Stateful
-from isac_rt.terminal.filter import Gaussian
-from isac_rt.terminal.fusion import (
+from isac_rt.track.filter import Gaussian
+from isac_rt.track.fusion import (
     Fused,
     Key,
     Name,
@@ -27,8 +27,8 @@ from isac_rt.terminal.fusion import (
     at_once,
     its_word,
 )
-from isac_rt.terminal.pool import Look, PooledTracker
-from isac_rt.terminal.retrospect import BATCH
+from isac_rt.track.pool import Look, PooledTracker
+from isac_rt.track.retrospect import BATCH
 
 HEADER_BITS = 64
 """Sender, time, length and checksum of a message."""

@@ -9,7 +9,7 @@ from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.settings import Accuracy
-from isac_rt.terminal.settings import Tracking
+from isac_rt.track.settings import Tracking
 from isac_rt.world.settings import City, MaterialOverride, Rcs, Waypoint
 
 __all__ = [

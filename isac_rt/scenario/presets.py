@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from isac_rt.receive.settings import COUNTS_WITH, Receivers
 from isac_rt.settings import Node
-from isac_rt.terminal.settings import Tracking
+from isac_rt.track.settings import Tracking
 
 PLAIN: dict[str, dict[str, Any]] = {
     "receivers": {

@@ -35,7 +35,7 @@ from isac_rt.scenario.sensors import Sensor, with_sensor
 from isac_rt.scenario.swarm import Uav, formations, unfolded
 from isac_rt.settings import Key, Name, Node, Positive, Problem, Seed, dotted
 from isac_rt.signal.settings import Accuracy
-from isac_rt.terminal.settings import Belief, Tracking
+from isac_rt.track.settings import Belief, Tracking
 from isac_rt.world.settings import City, Formation
 
 OWN = "own"

@@ -53,7 +53,7 @@ from isac_rt.simulation.plan import (
 )
 from isac_rt.simulation.setup import Frame, Setup
 from isac_rt.simulation.simulate import stage_seconds
-from isac_rt.terminal.self_calibration import SelfCalibration
+from isac_rt.track.self_calibration import SelfCalibration
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 

@@ -17,8 +17,8 @@ from isac_rt.results.records import LateRecord
 from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
-from isac_rt.terminal.filter import Ambiguity
-from isac_rt.terminal.fusion import (
+from isac_rt.track.filter import Ambiguity
+from isac_rt.track.fusion import (
     Fused,
     KnownBody,
     Picture,
@@ -28,9 +28,9 @@ from isac_rt.terminal.fusion import (
     its_word,
     of_itself,
 )
-from isac_rt.terminal.pool import Lives, Look, PooledTracker
-from isac_rt.terminal.terminal import TerminalState
-from isac_rt.terminal.tracker import in_plane
+from isac_rt.track.pool import Lives, Look, PooledTracker
+from isac_rt.track.terminal import TerminalState
+from isac_rt.track.tracker import in_plane
 from isac_rt.world.swarm import Pose
 
 AHEAD = 2

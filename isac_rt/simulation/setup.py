@@ -55,9 +55,9 @@ from isac_rt.simulation.preflight import (
     warn_of_unseen,
 )
 from isac_rt.simulation.stopwatch import NONE, Seconds
-from isac_rt.terminal.expectation import ClutterExpectation, Mistakes, make_expectation
-from isac_rt.terminal.ghosts import Walls
-from isac_rt.terminal.settings import Belief
+from isac_rt.track.expectation import ClutterExpectation, Mistakes, make_expectation
+from isac_rt.track.ghosts import Walls
+from isac_rt.track.settings import Belief
 from isac_rt.world.area import city_about, city_digest
 from isac_rt.world.city import CityMesh
 from isac_rt.world.swarm import Pose, Swarm

@@ -38,9 +38,9 @@ from isac_rt.simulation.preflight import receivers_at_work
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
 from isac_rt.simulation.stopwatch import Stopwatch
-from isac_rt.terminal.fusion import KnownBody
-from isac_rt.terminal.retrospect import Late
-from isac_rt.terminal.terminal import (
+from isac_rt.track.fusion import KnownBody
+from isac_rt.track.retrospect import Late
+from isac_rt.track.terminal import (
     ActiveTerminal,
     PassiveTerminal,
     Receiver,

@@ -18,8 +18,8 @@ from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.plain import plain, restored
 from isac_rt.receive.types import Detections, Reception, no_detections
-from isac_rt.terminal.filter import Gaussian
-from isac_rt.terminal.tracker import Track, TrackSet, track_set
+from isac_rt.track.filter import Gaussian
+from isac_rt.track.tracker import Track, TrackSet, track_set
 from isac_rt.world.swarm import Pose
 
 C = 299_792_458.0

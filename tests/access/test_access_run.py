@@ -191,7 +191,7 @@ def test_feedback_undoes_a_slip(monkeypatch, feedback):
     terminal processes every second frame.
 
     Planted bug: the range moved the other way."""
-    from isac_rt.terminal import terminal
+    from isac_rt.track import terminal
 
     monkeypatch.setattr(terminal, "slip_cells", lambda ends, size: 0)
     step, times = terminal.PassiveTerminal.step, []

@@ -21,10 +21,10 @@ from isac_rt.access.messages import (
 )
 from isac_rt.plain import plain
 from isac_rt.storage import pack, unpack
-from isac_rt.terminal.filter import Ambiguity, Gaussian
-from isac_rt.terminal.fusion import DATUM_STD, ERRORS, Key, Told
-from isac_rt.terminal.pool import Lives, Look, PooledTracker
-from isac_rt.terminal.settings import Tracking
+from isac_rt.track.filter import Ambiguity, Gaussian
+from isac_rt.track.fusion import DATUM_STD, ERRORS, Key, Told
+from isac_rt.track.pool import Lives, Look, PooledTracker
+from isac_rt.track.settings import Tracking
 from isac_rt.world.swarm import Pose
 
 T = 0.05

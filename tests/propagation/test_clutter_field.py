@@ -490,7 +490,7 @@ def expectation(
     city: CityMesh, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0), pattern="isotropic", gain_dbi=0.0
 ):
     """A terminal's own copy of the mesh and its pose."""
-    from isac_rt.terminal.expectation import make_expectation
+    from isac_rt.track.expectation import make_expectation
 
     tree = {
         "frames": 40,
@@ -561,7 +561,7 @@ def test_expected_clutter_is_the_walls_integral_and_its_mistakes_are_what_they_s
     a face agree on how far, by the distance to the moved points. Planted bugs: amplitude for power;
     a level in amplitudes' decibels; the velocity's error with the other sign; the face's error
     taken along the ray; elements left out; the mesh's origin left out."""
-    from isac_rt.terminal.expectation import Mistakes
+    from isac_rt.track.expectation import Mistakes
 
     city = rectangle((-60.0, 50.0, -30.0), (120.0, 0, 0), (0, 0, 60.0), METAL)
     city = replace(city, origin=np.array([310.7, -120.3, 41.9]))
@@ -775,7 +775,7 @@ def test_expected_bistatic_clutter_is_that_of_the_field_between_two_terminals():
     assert found.delay_rate * C == pytest.approx(rate, rel=0, abs=1e-9)
     truth = amplitude**2 * lambertian_wall(there, at, 0.43)
     assert abs(10 * np.log10(found.power.sum() / truth)) < 0.05
-    from isac_rt.terminal.expectation import Mistakes
+    from isac_rt.track.expectation import Mistakes
 
     # a terminal that is wrong: 3 dB, its own velocity, and either triangle of the wall moved
     mistakes = Mistakes((0.3, 0.0, 0.0), 3.0, 0.1)

@@ -34,7 +34,7 @@ from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator
 from isac_rt.simulation.setup import propagation_in, swarm_of
-from isac_rt.terminal.expectation import Mistakes, make_expectation
+from isac_rt.track.expectation import Mistakes, make_expectation
 from isac_rt.world.city import CityMesh, Material, load_city
 from isac_rt.world.swarm import Pose
 

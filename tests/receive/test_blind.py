@@ -13,8 +13,8 @@ from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.symbols.blind import Peaks, _comb, _Seen, acquire, find_peaks, read_peaks
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.terminal import PassiveTerminal, TerminalState
+from isac_rt.track.settings import Tracking
+from isac_rt.track.terminal import PassiveTerminal, TerminalState
 from isac_rt.world.swarm import Pose
 
 W = Waveform(num_samples=256, num_chirps=48)

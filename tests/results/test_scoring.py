@@ -20,7 +20,7 @@ from isac_rt.results.scoring import Heard, Scorer
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import swarm_of, timetable_of
-from isac_rt.terminal.tracker import TrackSet
+from isac_rt.track.tracker import TrackSet
 
 UAVS = {
     "U1": Uav(role="target", position_m=(-1.3, 4.9, 10.1), velocity_mps=(0.5, 9.7, 0.3)),

@@ -16,8 +16,8 @@ from isac_rt.results.swarm import SWARM, SwarmScorer, Traffic, View, summary_of
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import timetable_of
-from isac_rt.terminal.filter import Gaussian
-from isac_rt.terminal.fusion import Fused, Key, Name
+from isac_rt.track.filter import Gaussian
+from isac_rt.track.fusion import Fused, Key, Name
 from isac_rt.world.swarm import Pose
 
 PLACES = {

@@ -12,8 +12,8 @@ from isac_rt.document import ScenarioError
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare
-from isac_rt.terminal import standing
-from isac_rt.terminal.settings import Belief
+from isac_rt.track import standing
+from isac_rt.track.settings import Belief
 
 SCENES = Path(__file__).parents[2] / "scenes"
 

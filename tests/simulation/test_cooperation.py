@@ -21,9 +21,9 @@ from isac_rt.simulation import simulate
 from isac_rt.simulation.cooperation import look_of
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.simulate import standard_terminal
-from isac_rt.terminal.filter import Gaussian, measure
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.tracker import Track, track_set
+from isac_rt.track.filter import Gaussian, measure
+from isac_rt.track.settings import Tracking
+from isac_rt.track.tracker import Track, track_set
 from isac_rt.views.animate import animate
 from isac_rt.views.moving_scene import moving_scene
 from isac_rt.views.tables import swarm_table

@@ -21,7 +21,7 @@ from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import setup as setting_up
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import Setup, prepare
-from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal
+from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
 
 RADIO = Radio(samples_per_chirp=256, bandwidth_hz=320e6, chirps_per_frame=12)
 

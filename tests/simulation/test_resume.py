@@ -32,7 +32,7 @@ from isac_rt.simulation import simulate
 from isac_rt.simulation.resume import EARLIER, FILE, Resume, ResumeError
 from isac_rt.simulation.setup import prepare
 from isac_rt.storage import ARRAY, checksum, pack, unpack
-from isac_rt.terminal.settings import Tracking
+from isac_rt.track.settings import Tracking
 
 ROOT = Path(__file__).parents[2]
 SCENES = ROOT / "scenes"

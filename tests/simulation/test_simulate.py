@@ -20,7 +20,7 @@ from isac_rt.results.files import open_results, save
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare
-from isac_rt.terminal.terminal import PassiveTerminal
+from isac_rt.track.terminal import PassiveTerminal
 
 SCENES = Path(__file__).parents[2] / "scenes"
 FRAMES = {"frames": 6}

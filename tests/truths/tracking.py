@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from isac_rt.results.metrics import binomial_interval, gospa
-from isac_rt.terminal.filter import (
+from isac_rt.track.filter import (
     BIRTH_SPEED_STD,
     MANOEUVRE_TIME,
     Gaussian,
@@ -21,7 +21,7 @@ from isac_rt.terminal.filter import (
     singer,
     update,
 )
-from isac_rt.terminal.settings import Tracking
+from isac_rt.track.settings import Tracking
 from isac_rt.world.swarm import Pose
 from truths import stage
 from truths.case import Errors, case, slow

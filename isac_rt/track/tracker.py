@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from isac_rt.plain import Stateful
 from isac_rt.receive.types import Detections, Prediction
-from isac_rt.terminal.filter import (
+from isac_rt.track.filter import (
     Ambiguity,
     Gaussian,
     birth,
@@ -26,7 +26,7 @@ from isac_rt.terminal.filter import (
     reported,
     update,
 )
-from isac_rt.terminal.settings import Tracking
+from isac_rt.track.settings import Tracking
 from isac_rt.world.swarm import Pose
 
 SURE_HITS = 2

@@ -17,11 +17,11 @@ from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
-from isac_rt.terminal.filter import Gaussian
-from isac_rt.terminal.fusion import KnownBody, of_itself
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal, TerminalState
-from isac_rt.terminal.tracker import Track
+from isac_rt.track.filter import Gaussian
+from isac_rt.track.fusion import KnownBody, of_itself
+from isac_rt.track.settings import Tracking
+from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal, TerminalState
+from isac_rt.track.tracker import Track
 from isac_rt.world.swarm import Pose, attitude
 
 W = Waveform(num_samples=256, num_chirps=36)

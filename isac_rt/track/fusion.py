@@ -21,8 +21,8 @@ from scipy.special import gammaincinv
 
 from isac_rt.kernels.jit import jit
 from isac_rt.plain import Stateful
-from isac_rt.terminal.filter import Gaussian, distance, singer
-from isac_rt.terminal.tracker import LEAST_APART, TrackSet, assign
+from isac_rt.track.filter import Gaussian, distance, singer
+from isac_rt.track.tracker import LEAST_APART, TrackSet, assign
 from isac_rt.world.swarm import Pose
 
 SIZE = 6

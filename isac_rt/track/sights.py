@@ -9,9 +9,9 @@ import numpy as np
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.types import Look
-from isac_rt.terminal.filter import Ambiguity, Gaussian, measure, wrapped
-from isac_rt.terminal.self_calibration import FREE, Change, Sight
-from isac_rt.terminal.tracker import TrackSet
+from isac_rt.track.filter import Ambiguity, Gaussian, measure, wrapped
+from isac_rt.track.self_calibration import FREE, Change, Sight
+from isac_rt.track.tracker import TrackSet
 from isac_rt.world.swarm import Pose
 
 POSITION_STD, VELOCITY_STD = 0.02, 0.05

@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 from isac_rt.receive.types import Detections
-from isac_rt.terminal.filter import (
+from isac_rt.track.filter import (
     BIRTH_SPEED_STD,
     STD_FLOOR,
     Ambiguity,
@@ -28,8 +28,8 @@ from isac_rt.terminal.filter import (
     update,
     wrapped,
 )
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.tracker import Track, Tracker, assign, united
+from isac_rt.track.settings import Tracking
+from isac_rt.track.tracker import Track, Tracker, assign, united
 from isac_rt.world.swarm import Pose, attitude
 
 OWN = Pose(

@@ -9,7 +9,7 @@ from oracles import slopes, what_is_measured
 from scipy.optimize import least_squares
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.terminal.filter import (
+from isac_rt.track.filter import (
     Ambiguity,
     Gaussian,
     birth,

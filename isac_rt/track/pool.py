@@ -18,7 +18,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from isac_rt.plain import Stateful
-from isac_rt.terminal.filter import (
+from isac_rt.track.filter import (
     STD_FLOOR,
     Ambiguity,
     Gaussian,
@@ -31,7 +31,7 @@ from isac_rt.terminal.filter import (
     transmitter_jacobian,
     wrapped,
 )
-from isac_rt.terminal.fusion import (
+from isac_rt.track.fusion import (
     ATTITUDE_STD,
     ERRORS,
     JOIN_PROBABILITY,
@@ -45,8 +45,8 @@ from isac_rt.terminal.fusion import (
     in_datum,
     recognise,
 )
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.tracker import ROUNDING, assign
+from isac_rt.track.settings import Tracking
+from isac_rt.track.tracker import ROUNDING, assign
 from isac_rt.world.swarm import Pose
 
 BODY = 9

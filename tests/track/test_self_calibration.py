@@ -18,11 +18,11 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import ExpectedClutter, Look
 from isac_rt.storage import pack, unpack
-from isac_rt.terminal.filter import Gaussian
-from isac_rt.terminal.self_calibration import FREE, Change, SelfCalibration, Sight
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.sights import seen_after
-from isac_rt.terminal.terminal import ActiveTerminal, PassiveTerminal
+from isac_rt.track.filter import Gaussian
+from isac_rt.track.self_calibration import FREE, Change, SelfCalibration, Sight
+from isac_rt.track.settings import Tracking
+from isac_rt.track.sights import seen_after
+from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
 from isac_rt.world.swarm import Pose
 
 C = 299_792_458.0

@@ -12,9 +12,9 @@ from scipy.optimize import brentq
 from scipy.stats import chi2
 
 from isac_rt.receive.types import Detections
-from isac_rt.terminal.filter import STD_FLOOR, UNAMBIGUOUS, Ambiguity, Gaussian, costs
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.tracker import Track, Tracker, assign
+from isac_rt.track.filter import STD_FLOOR, UNAMBIGUOUS, Ambiguity, Gaussian, costs
+from isac_rt.track.settings import Tracking
+from isac_rt.track.tracker import Track, Tracker, assign
 from isac_rt.world.swarm import Pose, attitude
 
 OWN = Pose(

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from isac_rt.receive.types import Detections
-from isac_rt.terminal.filter import UNAMBIGUOUS, Gaussian
-from isac_rt.terminal.ghosts import Walls
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.standing import MEMORY_S, Standing
-from isac_rt.terminal.tracker import Track, Tracker
+from isac_rt.track.filter import UNAMBIGUOUS, Gaussian
+from isac_rt.track.ghosts import Walls
+from isac_rt.track.settings import Tracking
+from isac_rt.track.standing import MEMORY_S, Standing
+from isac_rt.track.tracker import Track, Tracker
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 

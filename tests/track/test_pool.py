@@ -12,10 +12,10 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from isac_rt.storage import pack, unpack
-from isac_rt.terminal.filter import Ambiguity, measure
-from isac_rt.terminal.fusion import ATTITUDE_STD, POSE_STD, Key, Name
-from isac_rt.terminal.pool import ERRORS, POSE, Lives, Look, Pool, PooledTracker, _View
-from isac_rt.terminal.settings import Tracking
+from isac_rt.track.filter import Ambiguity, measure
+from isac_rt.track.fusion import ATTITUDE_STD, POSE_STD, Key, Name
+from isac_rt.track.pool import ERRORS, POSE, Lives, Look, Pool, PooledTracker, _View
+from isac_rt.track.settings import Tracking
 from isac_rt.world.swarm import Pose
 
 T = 0.05

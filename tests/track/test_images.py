@@ -8,11 +8,11 @@ import pytest
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
-from isac_rt.terminal.filter import Ambiguity
-from isac_rt.terminal.ghosts import Walls
-from isac_rt.terminal.images import Doubts, _by_one, _by_two, own_images, sender_images
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.tracker import Tracker
+from isac_rt.track.filter import Ambiguity
+from isac_rt.track.ghosts import Walls
+from isac_rt.track.images import Doubts, _by_one, _by_two, own_images, sender_images
+from isac_rt.track.settings import Tracking
+from isac_rt.track.tracker import Tracker
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, attitude
 

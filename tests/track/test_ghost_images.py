@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.terminal.filter import Ambiguity, Gaussian
-from isac_rt.terminal.ghosts import Leeway, Walls, echoes, reflections, suspicion
-from isac_rt.terminal.tracker import Track, track_set
+from isac_rt.track.filter import Ambiguity, Gaussian
+from isac_rt.track.ghosts import Leeway, Walls, echoes, reflections, suspicion
+from isac_rt.track.tracker import Track, track_set
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 

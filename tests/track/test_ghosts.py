@@ -12,11 +12,11 @@ import trimesh
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
-from isac_rt.terminal.filter import Ambiguity, Gaussian
-from isac_rt.terminal.ghosts import Leeway, Walls, echoes, reflections, suspicion
-from isac_rt.terminal.images import Doubts
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.tracker import Track, Tracker, track_set
+from isac_rt.track.filter import Ambiguity, Gaussian
+from isac_rt.track.ghosts import Leeway, Walls, echoes, reflections, suspicion
+from isac_rt.track.images import Doubts
+from isac_rt.track.settings import Tracking
+from isac_rt.track.tracker import Track, Tracker, track_set
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 from reproduce.ghosts import explained_tracks, run, verdicts, whole_tracks

@@ -12,8 +12,8 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from isac_rt.terminal.filter import Gaussian, bistatic_distance, predict
-from isac_rt.terminal.fusion import (
+from isac_rt.track.filter import Gaussian, bistatic_distance, predict
+from isac_rt.track.fusion import (
     ATTITUDE_STD,
     DATUM_STD,
     ERRORS,
@@ -35,7 +35,7 @@ from isac_rt.terminal.fusion import (
     of_itself,
     together,
 )
-from isac_rt.terminal.tracker import TrackSet
+from isac_rt.track.tracker import TrackSet
 from isac_rt.world.swarm import Pose
 
 RNG = np.random.default_rng(20)

@@ -12,10 +12,10 @@ from isac_rt.frame.payload import random_payload
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections
-from isac_rt.terminal.filter import Gaussian, measure
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.terminal import PassiveTerminal, Surroundings
-from isac_rt.terminal.tracker import Track
+from isac_rt.track.filter import Gaussian, measure
+from isac_rt.track.settings import Tracking
+from isac_rt.track.terminal import PassiveTerminal, Surroundings
+from isac_rt.track.tracker import Track
 from isac_rt.world.swarm import Pose
 
 W = Waveform(num_samples=256, num_chirps=48)

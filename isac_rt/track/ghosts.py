@@ -25,8 +25,8 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas, resolutions
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.jit import jit
-from isac_rt.terminal.filter import Ambiguity, measure, wrapped
-from isac_rt.terminal.tracker import TrackSet
+from isac_rt.track.filter import Ambiguity, measure, wrapped
+from isac_rt.track.tracker import TrackSet
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 

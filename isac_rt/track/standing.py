@@ -18,8 +18,8 @@ from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.waveform import Waveform
 from isac_rt.plain import Stateful
 from isac_rt.receive.types import Detections
-from isac_rt.terminal.ghosts import Walls
-from isac_rt.terminal.tracker import Track, Tracker
+from isac_rt.track.ghosts import Walls
+from isac_rt.track.tracker import Track, Tracker
 from isac_rt.world.swarm import Pose
 
 STILL_MPS = 0.5

@@ -34,7 +34,7 @@ from isac_rt.receive.types import (
     Prediction,
     Reception,
 )
-from isac_rt.terminal.filter import (
+from isac_rt.track.filter import (
     Ambiguity,
     Gaussian,
     birth,
@@ -46,15 +46,15 @@ from isac_rt.terminal.filter import (
     update,
     wrapped,
 )
-from isac_rt.terminal.fusion import KnownBody, of_itself
-from isac_rt.terminal.ghosts import Walls
-from isac_rt.terminal.images import WELL_INSIDE, Doubts, sender_images
-from isac_rt.terminal.retrospect import COAST_CELLS, Late, Retrospect
-from isac_rt.terminal.self_calibration import calibration_of
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.sights import echoes, lines_of_sight, seen_after
-from isac_rt.terminal.standing import Standing, rests
-from isac_rt.terminal.tracker import Track, Tracker, TrackSet, in_plane
+from isac_rt.track.fusion import KnownBody, of_itself
+from isac_rt.track.ghosts import Walls
+from isac_rt.track.images import WELL_INSIDE, Doubts, sender_images
+from isac_rt.track.retrospect import COAST_CELLS, Late, Retrospect
+from isac_rt.track.self_calibration import calibration_of
+from isac_rt.track.settings import Tracking
+from isac_rt.track.sights import echoes, lines_of_sight, seen_after
+from isac_rt.track.standing import Standing, rests
+from isac_rt.track.tracker import Track, Tracker, TrackSet, in_plane
 from isac_rt.world.swarm import Pose
 
 LEVEL_DROP = 10.0

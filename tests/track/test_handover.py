@@ -16,16 +16,16 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Reception, no_detections
-from isac_rt.terminal.filter import Gaussian
-from isac_rt.terminal.settings import Tracking
-from isac_rt.terminal.terminal import (
+from isac_rt.track.filter import Gaussian
+from isac_rt.track.settings import Tracking
+from isac_rt.track.terminal import (
     ActiveTerminal,
     PassiveTerminal,
     Surroundings,
     TerminalState,
     slip_cells,
 )
-from isac_rt.terminal.tracker import Track
+from isac_rt.track.tracker import Track
 from isac_rt.world.swarm import Pose
 
 W = Waveform(num_samples=256, num_chirps=36)

@@ -20,9 +20,9 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.jit import jit
 from isac_rt.receive.types import Detections
-from isac_rt.terminal.filter import Gaussian, wrapped
-from isac_rt.terminal.ghosts import Leeway, Walls, suspicion
-from isac_rt.terminal.tracker import Track, Tracker, track_set
+from isac_rt.track.filter import Gaussian, wrapped
+from isac_rt.track.ghosts import Leeway, Walls, suspicion
+from isac_rt.track.tracker import Track, Tracker, track_set
 from isac_rt.world.swarm import Pose
 
 EDGE = 0.3
