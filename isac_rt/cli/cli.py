@@ -7,7 +7,6 @@ else.
 
 from __future__ import annotations
 
-import atexit
 import os
 import sys
 import traceback
@@ -104,14 +103,34 @@ def _say_warning(message: Warning | str, category: type[Warning], *_: Any) -> No
         err().print(Text.assemble(("warning", "yellow"), f" {message}"), soft_wrap=True)
 
 
-def _leave(status: list[int]) -> None:
-    """End the process, once all else that waits for its end is done: Python would look through all
-    that was loaded, and take it apart (1 s)."""
-    with suppress(OSError, ValueError):  # nobody reads what it says: as Python ends then
-        for said in filter(None, (sys.stdout, sys.stderr)):  # None: closed before Python began
-            said.flush()
-        if status:
-            os._exit(*status)
+def _settle_streams() -> None:
+    """Give the process streams that take every text: what was closed before it began is as
+    `/dev/null`, and letters that stdout cannot encode are replaced (stderr escapes them)."""
+    while (opened := os.open(os.devnull, os.O_RDWR)) < 3:  # the lowest number that is free
+        pass
+    os.close(opened)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))
+    stdout: Any = sys.stdout
+    stdout.reconfigure(errors="replace")
+
+
+def _flush_streams() -> None:
+    """Write what is left; nobody may read it any more, which is no error."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            with suppress(OSError, ValueError):
+                os.dup2(nowhere, stream.fileno())
+
+
+def _complain(text: str) -> None:
+    """Write a message to stderr, if that can be written."""
+    with suppress(OSError, ValueError):
+        sys.stderr.write(f"{text}\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -119,10 +138,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     which are then the process's own."""
     if arguments is not None:
         return _main(arguments)
-    status: list[int] = []
-    atexit.register(_leave, status)
-    status.append(_main(sys.argv[1:]))
-    return status[0]
+    _settle_streams()
+    status = _main(sys.argv[1:])
+    _flush_streams()
+    return status
 
 
 def _main(arguments: Sequence[str]) -> int:
@@ -150,18 +169,18 @@ def _main(arguments: Sequence[str]) -> int:
         if hasattr(problem, "exit_code"):  # typer's own: usage errors, exits and aborts
             text = problem.format_message() if hasattr(problem, "format_message") else ""
             if text:
-                sys.stderr.write(f"{text} (see isac-rt --help)\n")
+                _complain(f"{text} (see isac-rt --help)")
             return int(problem.exit_code)
         if isinstance(problem, UserError):
-            sys.stderr.write(f"{problem}\n")
+            _complain(str(problem))
             return 2
         if of_machine(problem):
             said = str(problem) or "there is no more memory"
-            sys.stderr.write(f"{type(problem).__name__}: {said} (the machine's disk or memory)\n")
+            _complain(f"{type(problem).__name__}: {said} (the machine's disk or memory)")
             return 2
-        sys.stderr.write(
+        _complain(
             f"{type(problem).__name__}: {problem} (this is a fault of isac_rt; {DEBUG}=1 shows "
-            "where)\n"
+            "where)"
         )
         return 1
 

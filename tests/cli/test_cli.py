@@ -55,30 +55,54 @@ def test_garbage_is_looked_for_less_often(capsys):
         gc.set_threshold(*usual)
 
 
-def test_the_end_looks_through_nothing():
-    """An object that only refers to itself is looked at when Python ends, and then says so; after
-    a command it is not. What waits for the end is done, and the status is the command's. Planted
-    bugs: no leaving; before what waits; with status 0; without what was said."""
-    code = (
-        "import atexit, gc, sys\ngc.disable()\nclass Garbage:\n"
-        "    def __del__(self): print('looked through')\n"
-        "one = Garbage(); one.itself = one; del one\n"
+PROCESS = "from isac_rt.cli.cli import main; import sys; sys.exit(main())"
+
+
+def shell(line: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[bytes]:
+    """What bash makes of a line in which `isac-rt` stands for the command in a process."""
+    command = f"{sys.executable} -c '{PROCESS}'"
+    return subprocess.run(
+        ["bash", "-c", f"set -o pipefail; {line.replace('isac-rt', command)}"],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
+        capture_output=True,
     )
-    command = (
-        "from isac_rt.cli.cli import main\nstatus = main()\natexit.register(print, 'waited')\n"
-        "sys.exit(status)"
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_letters_that_a_terminal_lacks_are_replaced(encoding, tmp_path):
+    """Planted bug: a traceback of Python's."""
+    text = "{name: n, swarm: {A: {role: active, position_m: [0, 0, 9]}}, \N{SNOWMAN}: 1}"
+    (tmp_path / "s.yaml").write_text(text)
+    done = shell("isac-rt plan s.yaml", tmp_path, PYTHONIOENCODING=encoding)
+    assert (done.returncode, done.stderr.count(b"\n")) == (2, 1)
+    program = (
+        "import sys; from isac_rt.cli import cli, console; cli._settle_streams()\n"
+        "console.say_table(['a \N{EN DASH} b'], [['\N{SNOWMAN}']])"
     )
-    for given, after, ends, said in (
-        ((), "", 0, ["looked"]),
-        (("--version",), command, 0, ["isac-rt", "waited"]),
-        (("none",), command, 2, ["waited"]),
-    ):
-        done = subprocess.run(
-            [sys.executable, "-c", code + after, *given], capture_output=True, text=True, cwd=ROOT
-        )
-        first_words = [line.split()[0] for line in done.stdout.splitlines()]
-        assert (done.returncode, first_words) == (ends, said)
-        assert "Traceback" not in done.stderr
+    environment = os.environ | {"PYTHONIOENCODING": encoding}
+    said = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True)
+    assert (said.returncode, said.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize(
+    ("line", "status", "said"),
+    [
+        ("isac-rt schema | head -1", 0, b""),
+        ("isac-rt --help | true", None, b""),
+        ("isac-rt plan none.yaml 2>&-", 2, b""),
+        ("isac-rt none 2>&-", 2, b""),
+        ("isac-rt plan none.yaml >&- 2>&- <&-", 2, b""),
+        ("isac-rt plan none.yaml 2>/dev/full", 2, b""),
+        ("isac-rt --version >&-", 0, b""),
+    ],
+)
+def test_nobody_reads_what_is_said(line, status, said, tmp_path):
+    """No traceback, and the status of what was asked. Planted bug: a message to a closed stderr
+    is an error of its own, with status 1."""
+    done = shell(line, tmp_path)
+    assert done.stderr == said
+    assert status is None or done.returncode == status
 
 
 @pytest.mark.parametrize(
