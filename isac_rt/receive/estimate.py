@@ -14,6 +14,7 @@ of it is linearised in the frame.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,23 +24,11 @@ import numpy as np
 
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.kernels import receive_directions
-from isac_rt.kernels.jit import jit, twin_of
+from isac_rt.kernels import receive_directions, receive_estimate
+from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.receive_directions import TIE
-from isac_rt.kernels.vector import (
-    LANES,
-    aligned,
-    cos_sin_double,
-    cos_sin_exact,
-    floor,
-    load,
-    narrow,
-    not_above,
-    splat,
-    store,
-    transpose,
-    unset,
-)
+from isac_rt.kernels.receive_estimate import Chirps, WindowAxis
+from isac_rt.kernels.vector import LANES, aligned, unset
 from isac_rt.receive import planar
 from isac_rt.receive.arms import arm, element_delays
 from isac_rt.receive.known import Known
@@ -54,7 +43,6 @@ _STENCIL = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1]
 """Places of a stencil down and across: its middle, the cross, the corners."""
 PULL = 1.0
 """Distance of another path in the cell [cells, bins]."""
-_NONE = np.float32(0)
 T = TypeVar("T", float, np.ndarray)
 
 
@@ -102,21 +90,35 @@ class LocalSpectra:
         aliases only. `beam` (L_tx, L_rx): only the responses' power times it counts, added over the
         receivers, and over the transmit antennas in phase or in power."""
         self.waveform, self._sent = known.waveform, _sent(known, separate)
-        self._beam, self._in_phase = _NO_BEAM if beam is None else beam, in_phase
+        self._beam, self._in_phase = beam, in_phase
         low = max(row - HALF_WIDTH, 0)
         count = min(row + HALF_WIDTH + 1, spectra.shape[2]) - low
         self._axis = _axis(known.waveform)._replace(first=float(low))
         self._num_rx = spectra.shape[1]
         self._chirps = _room(self._sent, self._num_rx, count)
-        _gather(np.ascontiguousarray(spectra), low, self._axis.share, self._chirps)
+        gather(np.ascontiguousarray(spectra), low, self._axis.share, self._chirps)
+
+    def _matched(self, delays: np.ndarray, delay_rates: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Matches (K, L_tx, L_rx) of templates with the samples, and the templates' energies
+        (K, L_tx)."""
+        size, blocks = self._sent.antennas, self._chirps.blocks
+        out = np.zeros((delays.size, size * blocks * 2 * LANES), np.float32)
+        energy = np.zeros((delays.size, size))
+        match(self._chirps, self._axis, delays, delay_rates, out, energy)
+        parts = out.reshape(delays.size, size, blocks, 2, LANES).astype(float)
+        values = (parts[..., 0, :] + 1j * parts[..., 1, :]).reshape(delays.size, size, -1)
+        return values[..., : self._num_rx], np.maximum(energy, 1e-30)
 
     def respond(self, delay: float, delay_rate: float) -> np.ndarray:
         """(L_tx, L_rx) matched response, normalised so that a path at (delay, delay_rate) gives its
         amplitude; of separate groups the mean, each antenna turned into the phase that it has in
         the first one."""
-        path = np.array([delay]), np.array([delay_rate])
-        out, energy = _matched(self._chirps, self._axis, *path, self._sent.antennas)
-        return _responses(out, energy, self._num_rx, self.waveform.num_tx)[0]
+        matched, energy = self._matched(np.array([delay]), np.array([delay_rate]))
+        sets = (matched[0] / energy[0, :, None]).reshape(-1, self.waveform.num_tx, self._num_rx)
+        if len(sets) == 1:
+            return sets[0]
+        turn = np.exp(-1j * np.angle((sets * sets[:1].conj()).sum(axis=2, keepdims=True)))
+        return np.asarray((sets * turn).mean(axis=0))
 
     def modes(self, delay: float, delay_rate: float) -> np.ndarray:
         """(MODES, L_tx, L_rx) amplitudes of a path by polynomials over the chirp: the least squares
@@ -125,13 +127,13 @@ class LocalSpectra:
         size, rows = c.tx.size, c.rows
         data = c.data.reshape(size, rows, c.blocks, 2, LANES)
         heard = (data[:, :, :, 0] + 1j * data[:, :, :, 1]).reshape(size, rows, -1)
-        tau = delay + delay_rate * c.time.ravel()[:size]
-        beat = a.slope * tau + delay_rate * (a.carrier + a.slope * (a.middle - tau))
-        near = (beat * a.duration - a.first)[:, None] - np.arange(rows)
-        cycles = (a.carrier * tau) % 1.0 + a.slope * tau * (a.middle - tau / 2)
+        w, time = self.waveform, c.time[:size]
+        beat = w.beat_cells(delay, delay_rate, time)
+        near = (beat - a.first)[:, None] - np.arange(rows)
+        cycles = w.phase(delay + delay_rate * time, w.window_middle)
         shapes = a.length / 2 * mode_shapes(near * a.share)
         shapes = shapes * np.exp(2j * np.pi * cycles)[:, None]
-        weight = c.weight.ravel()[:size]
+        weight = c.weight[:size]
         out = np.empty((MODES, self._sent.antennas, self._num_rx), complex)
         for antenna in range(self._sent.antennas):
             sent = c.tx == antenna
@@ -148,17 +150,29 @@ class LocalSpectra:
         """Energies (K,) that templates explain, summed over the virtual channels, or powers of the
         beam: what the estimate maximises. At the ends of the range axis part of a template lies
         outside, so that the amplitude alone would draw the estimate out."""
-        how = self._sent.antennas, self._beam, self._in_phase
-        return _powers(self._chirps, self._axis, delays, delay_rates, *how)
+        matched, energy = self._matched(delays, delay_rates)
+        if self._beam is None:
+            explained = (matched.real**2 + matched.imag**2).sum(axis=2) / energy
+            return np.asarray(explained.sum(axis=1))
+        added = (self._beam * matched).sum(axis=2) / energy
+        if self._in_phase:
+            added = added.sum(axis=1, keepdims=True)
+        return np.asarray((added.real**2 + added.imag**2).sum(axis=1))
 
-    def climb(self, delay: float, delay_rate: float, steps: np.ndarray) -> tuple[float, float]:
-        """As `refine`."""
-        how = self._sent.antennas, self._beam, self._in_phase
-        units = _units(self.waveform)
-        return _climb(self._chirps, self._axis, delay, delay_rate, steps, units, *how)
-
-
-_NO_BEAM = np.zeros((0, 0), complex)
+    def climb(self, delay: float, delay_rate: float, steps: Sequence[float]) -> tuple[float, float]:
+        """As `refine`, in the coordinates beat at mid-frame and Doppler, which decouple; the beat
+        holds the coupling."""
+        delay_unit, rate_unit, coupling = _units(self.waveform)
+        beat = delay / delay_unit + delay_rate / rate_unit * coupling
+        doppler, mixed = delay_rate / rate_unit, 0.0
+        for number, step in enumerate(steps):
+            stencil = _STENCIL[: 5 if number else len(_STENCIL)]
+            across = doppler + step * stencil[:, 1]
+            delays = (beat + step * stencil[:, 0] - across * coupling) * delay_unit
+            powers = self.powers(delays, across * rate_unit)
+            down, up, mixed = _newton(powers, step, mixed)
+            beat, doppler = beat + down, doppler + up
+        return (beat - doppler * coupling) * delay_unit, doppler * rate_unit
 
 
 class _Sent(NamedTuple):
@@ -182,212 +196,70 @@ def _sent(known: Known, separate: bool) -> _Sent:
     return _Sent(weight, time, tx, w.num_tx * (w.num_groups if separate else 1))
 
 
-class _Chirps(NamedTuple):
-    """Samples of `rows` range rows, float32: of each chirp and row the real and imaginary parts of
-    `blocks` times sixteen receivers; and of each chirp its weight, time [s] and antenna, the first
-    two filled up to a multiple of sixteen. `tile`: room for sixteen times sixteen."""
-
-    data: np.ndarray
-    rows: int
-    blocks: int
-    weight: np.ndarray
-    time: np.ndarray
-    tx: np.ndarray
-    tile: np.ndarray
-
-
-def _room(sent: _Sent, num_rx: int, rows: int) -> _Chirps:
+def _room(sent: _Sent, num_rx: int, rows: int) -> Chirps:
     """Without samples yet."""
     weight, time, tx, _ = sent
     blocks = -(-num_rx // LANES)
     data = unset(tx.size * rows * blocks * 2 * LANES)
-    return _Chirps(data, rows, blocks, weight, time, tx, aligned(LANES * LANES))
+    return Chirps(data, rows, blocks, weight, time, tx, aligned(LANES * LANES))
 
 
-class _Axis(NamedTuple):
-    """What a template depends on of the waveform, the window's cells to a range cell, and the first
-    row."""
-
-    carrier: float
-    slope: float
-    middle: float
-    duration: float
-    length: float
-    share: float
-    first: float
-
-
-def _axis(waveform: Waveform) -> _Axis:
+def _axis(waveform: Waveform) -> WindowAxis:
     """Of all rows."""
     w = waveform
     share = w.window_length / w.num_samples
     window = w.window_middle, w.sampled_duration, w.window_length, share
-    return _Axis(w.carrier_frequency, w.slope, *window, 0.0)
+    return WindowAxis(w.carrier_frequency, w.slope, *window, 0.0)
 
 
-@jit(fast=True, borrows=True)
-def _square(flat, start, to_next, lanes, count, tile):
-    """Fill the tile with `count` complex values of each of `lanes` receivers, `to_next` apart from
-    `start` on, and turn it over: real and imaginary parts of one value of all receivers."""
-    if lanes < LANES or count < LANES // 2:
-        tile[:] = _NONE
-    for r in range(lanes):
-        at = start + r * to_next
-        if count == LANES // 2:
-            store(tile, LANES * r, load(flat, at))
-        else:
-            for i in range(2 * count):
-                tile[LANES * r + i] = flat[at + i]
-    transpose(tile, 0)
+@twin_of(receive_estimate.gather)
+def gather(spectra: np.ndarray, low: int, share: float, chirps: Chirps) -> None:
+    """Fill `chirps.data` with rows from `low` of spectra (M, L_rx, rows, P).
+
+    The window begins at sample 0 and its transform is real about its middle: the turn from row to
+    row is taken out here.
+    """
+    row = low + np.arange(chirps.rows)
+    turned = spectra[:, :, row] * np.exp(1j * np.pi * row * share)[:, None]
+    each = turned.transpose(0, 3, 2, 1).reshape(-1, chirps.rows, spectra.shape[1])
+    lanes = chirps.blocks * LANES
+    padded = np.pad(each, ((0, 0), (0, 0), (0, lanes - each.shape[2])))
+    padded = padded.reshape(*padded.shape[:2], chirps.blocks, 1, LANES)
+    chirps.data[:] = np.concatenate([padded.real, padded.imag], axis=3).ravel()
 
 
-@jit(fast=True, borrows=True)
-def _gather(spectra, low, share, chirps):
-    """Fill `chirps.data` with rows from `low`. The window begins at sample 0 and its transform is
-    real about its middle: the turn from row to row is taken out here. Eight chirps of sixteen
-    receivers at a time."""
-    groups, num_rx, num_rows, num_chirps = spectra.shape
-    flat, tile, out = spectra.reshape(-1).view(np.float32), chirps.tile, chirps.data
-    rows, blocks, to_next = chirps.rows, chirps.blocks, 2 * num_rows * num_chirps
-    for i in range(rows):
-        angle = np.pi * (low + i) * share
-        c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-        for m in range(groups):
-            for b in range(blocks):
-                lanes = min(LANES, num_rx - LANES * b)
-                start = (m * num_rx + LANES * b) * to_next + 2 * (low + i) * num_chirps
-                for p in range(0, num_chirps, LANES // 2):
-                    count = min(LANES // 2, num_chirps - p)
-                    _square(flat, start + 2 * p, to_next, lanes, count, tile)
-                    for q in range(count):
-                        re, im = load(tile, 2 * LANES * q), load(tile, 2 * LANES * q + LANES)
-                        to = (((m * num_chirps + p + q) * rows + i) * blocks + b) * 2 * LANES
-                        store(out, to, c * re - s * im)
-                        store(out, to + LANES, s * re + c * im)
+@twin_of(receive_estimate.match)
+def match(
+    chirps: Chirps,
+    axis: WindowAxis,
+    delays: np.ndarray,
+    delay_rates: np.ndarray,
+    out: np.ndarray,
+    energy: np.ndarray,
+) -> None:
+    """Add to `out`, of every path and transmit antenna, the sum of conj(template) times data, and
+    to `energy` (K, antennas) that of the template: Phi of the module's docstring, weighted by
+    chirp, with the window's transform in the rows.
 
-
-@jit(fast=True, borrows=True)
-def _template(chirps, axis, first, delay, delay_rate, steps, out):
-    """Of a path in the sixteen chirps from `first` on, sixteen float32 each: weighted cosine and
-    sine, weight times the sum of the rows' squared factors, and the rows' real factors. Beat, phase
-    and `hann_response`; a test holds them against these. `steps` : cosine and sine from the first
-    row to each."""
-    carrier, slope, middle, duration, length, share, low = axis
-    weight, tau = narrow(load(chirps.weight, first)), delay + delay_rate * load(chirps.time, first)
-    near = (slope * tau + delay_rate * (carrier + slope * (middle - tau))) * duration
-    near = (near - low) * share
-    turns, chirp, half = carrier * tau, slope * tau * (middle - 0.5 * tau), 0.5 * near
-    cycles = turns - floor(turns) + chirp - floor(chirp)
-    c, s = cos_sin_exact(cycles - floor(cycles + 0.5))
-    store(out, 0, weight * c)
-    store(out, LANES, weight * s)
-    c, s = cos_sin_double(half - floor(half + 0.5))
-    energy = splat(_NONE)
-    for k in range(chirps.rows):
-        d = near - k * share
-        value, under = s * steps[0, k] - c * steps[1, k], np.pi * d * (1.0 - d * d)
-        # at its middle and at the ends of its lobe the quotient is 1 and 1/2
-        at_hole, inside = not_above(under * under, splat(1e-16)), not_above(d * d, splat(0.25))
-        value = value + at_hole * (0.5 + 0.5 * inside - value)
-        under = under + at_hole * (1.0 - under)
-        factor = np.float32(length / 2) * (narrow(value) / narrow(under))
-        store(out, (3 + k) * LANES, factor)
-        energy = energy + factor * factor
-    store(out, 2 * LANES, weight * energy)
-
-
-@jit(inline=True)
-def _add_chirp(chirps, chirp, template, lane, out, to):
-    """Add to out[to:] conj(template) times the data of a chirp, which has that lane of the
-    template."""
-    rows, data = chirps.rows, chirps.data
-    line = 2 * LANES * chirps.blocks
-    c, s = template[lane], template[LANES + lane]
-    for start in range(0, line, 2 * LANES):
-        at = chirp * rows * line + start
-        re, im = splat(_NONE), splat(_NONE)
-        for k in range(rows):
-            factor = template[(3 + k) * LANES + lane]
-            re = re + factor * load(data, at)
-            im = im + factor * load(data, at + LANES)
-            at += line
-        store(out, to + start, load(out, to + start) + c * re + s * im)
-        store(out, to + start + LANES, load(out, to + start + LANES) + c * im - s * re)
-
-
-@jit(fast=True)
-def _match(chirps, axis, delays, delay_rates, out, energy):
-    """Add to `out` (K, antennas * line), of every path and transmit antenna, the sum of
-    conj(template) times data, flat blocks of sixteen real and imaginary parts; and to `energy` (K,
-    antennas) that of the template."""
-    angle = np.pi * axis.share * np.arange(chirps.rows)
-    steps = np.stack((np.cos(angle), np.sin(angle)))
-    _add_matches(chirps, axis, delays, delay_rates, steps, out, energy)
-
-
-@jit(fast=True, borrows=True)
-def _add_matches(chirps, axis, delays, delay_rates, steps, out, energy):
-    """`_match`, with the `steps` of `_template`."""
-    flat, line, template = out.reshape(-1), 2 * LANES * chirps.blocks, chirps.tile
-    for first in range(0, chirps.tx.size, LANES):
-        for j in range(delays.size):
-            _template(chirps, axis, first, delays[j], delay_rates[j], steps, template)
-            for i in range(min(LANES, chirps.tx.size - first)):
-                tx = chirps.tx[first + i]
-                energy[j, tx] += template[2 * LANES + i]
-                to = j * out.shape[1] + tx * line
-                _add_chirp(chirps, first + i, template, i, flat, to)
-
-
-@jit
-def _matched(chirps, axis, delays, delay_rates, antennas):
-    """`_match` in new arrays."""
-    line = 2 * LANES * chirps.blocks
-    out = np.zeros((delays.size, antennas * line), np.float32)
-    energy = np.zeros((delays.size, antennas))
-    _match(chirps, axis, delays, delay_rates, out, energy)
-    return out, energy
-
-
-@jit
-def _powers(chirps, axis, delays, delay_rates, antennas, beam, in_phase):
-    """`LocalSpectra.powers`; `beam` (0, 0): there is none."""
-    total, added = np.zeros(delays.size), np.empty(beam.shape[0], np.complex128)
-    every, energies = _matched(chirps, axis, delays, delay_rates, antennas)
-    line = every.shape[1] // antennas
-    for j in range(delays.size):
-        out, energy = every[j], energies[j]
-        if not beam.size:
-            for t in range(antennas):
-                square = 0.0
-                for c in range(t * line, (t + 1) * line):
-                    square += np.float64(out[c]) ** 2
-                total[j] += square / max(energy[t], 1e-30)
-            continue
-        added[:] = 0.0
-        for t in range(beam.shape[0]):
-            for r in range(beam.shape[1]):
-                at = t * line + r // LANES * 2 * LANES + r % LANES
-                added[t] += beam[t, r] * complex(out[at], out[at + LANES])
-            added[t] /= max(energy[t], 1e-30)
-        if in_phase:
-            added[0] = added.sum()
-        for t in range(1 if in_phase else added.size):
-            total[j] += added[t].real ** 2 + added[t].imag ** 2
-    return total
-
-
-def _responses(out: np.ndarray, energy: np.ndarray, num_rx: int, num_tx: int) -> np.ndarray:
-    """(Q, L_tx, L_rx) `LocalSpectra.respond`, from Q results of `_match`."""
-    blocks = -(-num_rx // LANES)
-    parts = out.reshape(*energy.shape, blocks, 2, LANES)
-    values = (parts[..., 0, :] + 1j * parts[..., 1, :]).reshape(*energy.shape, blocks * LANES)
-    values = values[..., :num_rx] / np.maximum(energy, 1e-30)[..., None]
-    if energy.shape[1] == num_tx:
-        return values
-    sets = values.reshape(len(out), energy.shape[1] // num_tx, num_tx, num_rx)
-    turn = np.exp(-1j * np.angle((sets * sets[:, :1].conj()).sum(axis=3, keepdims=True)))
-    return (sets * turn).mean(axis=1)
+    `out` (K, antennas * line) float32: blocks of sixteen real, then sixteen imaginary parts.
+    """
+    size, a = chirps.tx.size, axis
+    data = chirps.data.reshape(size, chirps.rows, -1)
+    weight, time = chirps.weight[:size], chirps.time[:size]
+    for k, (delay, rate) in enumerate(zip(delays, delay_rates, strict=True)):
+        tau = delay + rate * time
+        beat = (a.slope * tau + rate * (a.carrier + a.slope * (a.middle - tau))) * a.duration
+        d = ((beat - a.first)[:, None] - np.arange(chirps.rows)) * a.share
+        hole = np.abs(np.abs(d) - 1) < 1e-9
+        safe = np.where(hole, 0.5, d)
+        factor = a.length / 2 * np.where(hole, 0.5, np.sinc(safe) / (1 - safe**2))
+        turn = np.exp(2j * np.pi * (a.carrier * tau % 1 + a.slope * tau * (a.middle - tau / 2)))
+        parts = np.einsum("cr,crl->cl", weight[:, None] * factor, data).reshape(size, -1, 2, LANES)
+        matched = (parts[:, :, 0] + 1j * parts[:, :, 1]) * turn.conj()[:, None, None]
+        sums = np.zeros((energy.shape[1], *matched.shape[1:]), complex)
+        np.add.at(sums, chirps.tx, matched)
+        out[k] += np.stack([sums.real, sums.imag], axis=2).ravel()
+        np.add.at(energy[k], chirps.tx, weight * (factor**2).sum(axis=1))
 
 
 def start_point(spectra_power: np.ndarray, row: T, column: T, waveform: Waveform) -> tuple[T, T]:
@@ -424,7 +296,7 @@ def refine(
     local: LocalSpectra, delay: float, delay_rate: float, steps: Sequence[float] = STENCILS
 ) -> Estimate:
     """Maximise the power by fitted paraboloids on shrinking stencils (cells and Doppler bins)."""
-    delay, delay_rate = local.climb(delay, delay_rate, np.array(steps))
+    delay, delay_rate = local.climb(delay, delay_rate, steps)
     return Estimate(delay, delay_rate, local.respond(delay, delay_rate))
 
 
@@ -436,35 +308,17 @@ def _units(waveform: Waveform) -> tuple[float, float, float]:
     return w.delay_step, rate, w.sampled_duration / w.frame_duration
 
 
-@jit
-def _climb(chirps, axis, delay, delay_rate, steps, units, antennas, beam, in_phase):
-    """`refine`, in the coordinates beat at mid-frame and Doppler, which decouple; the beat holds
-    the coupling."""
-    delay_unit, rate_unit, coupling = units
-    beat = delay / delay_unit + delay_rate / rate_unit * coupling
-    doppler, mixed = delay_rate / rate_unit, 0.0
-    for number in range(steps.size):
-        count = 5 if number else len(_STENCIL)
-        across = doppler + steps[number] * _STENCIL[:count, 1]
-        delays = (beat + steps[number] * _STENCIL[:count, 0] - across * coupling) * delay_unit
-        args = delays, across * rate_unit, antennas, beam, in_phase
-        down, up, mixed = _newton(_powers(chirps, axis, *args), steps[number], mixed)
-        beat, doppler = beat + down, doppler + up
-    return (beat - doppler * coupling) * delay_unit, doppler * rate_unit
-
-
-@jit
 def _newton(powers: np.ndarray, step: float, mixed: float) -> tuple[float, float, float]:
     """Move down and across to the top of a paraboloid through the logarithms of the powers on a
     stencil of a half width, and its mixed derivative, which a stencil without corners is told: it
     is small in these coordinates, so that what the first says is good enough."""
-    g = np.log(np.maximum(powers, 1e-300))
+    g = np.log(np.maximum(powers, 1e-300)).tolist()
     gx, gy = (g[2] - g[1]) / (2 * step), (g[4] - g[3]) / (2 * step)
     hxx = (g[2] - 2 * g[0] + g[1]) / step**2
     hyy = (g[4] - 2 * g[0] + g[3]) / step**2
-    hxy = (g[8] - g[7] - g[6] + g[5]) / (4 * step**2) if g.size > 5 else mixed
+    hxy = (g[8] - g[7] - g[6] + g[5]) / (4 * step**2) if len(g) > 5 else mixed
     det = hxx * hyy - hxy**2
-    down, across = np.copysign(step, gx), np.copysign(step, gy)
+    down, across = math.copysign(step, gx), math.copysign(step, gy)
     if hxx < 0 and det > 0:
         down, across = (hyy * gx - hxy * gy) / -det, (hxx * gy - hxy * gx) / -det
     most = 3 * step

@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isac_rt.kernels.jit import jit
+from isac_rt.kernels import receive_estimate
+from isac_rt.kernels.jit import twin_of
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.cfar import CfarRule, first_row, hann_envelope, peaks, without_sidelobes
 from isac_rt.receive.estimate import (
@@ -303,7 +304,7 @@ def _add(spectra: np.ndarray, path: _Path, known: Known, sign: float) -> None:
     """Add a path times `sign` to the rows in which it was taken out, in place."""
     w, e = known.waveform, path.estimate
     cycles = w.phase(e.delay + e.delay_rate * known.times, w.window_middle)
-    _add_template(
+    add_template(
         spectra,
         path.rows,
         sign * e.channels,
@@ -316,33 +317,32 @@ def _add(spectra: np.ndarray, path: _Path, known: Known, sign: float) -> None:
     )
 
 
-@jit
-def _add_template(spectra, rows, channels, schedule, beat, turn, sent, heard, window):
-    """spectra[m, rx, i, p] += channels[tx, rx] turn[m, p] `hann_response`(beat + sent + heard - i)
-    exp(-j pi i length / size), tx the antenna of the chirp, for i in [*rows)."""
+@twin_of(receive_estimate.add_template)
+def add_template(
+    spectra: np.ndarray,
+    rows: tuple[int, int],
+    channels: np.ndarray,
+    schedule: np.ndarray,
+    beat: np.ndarray,
+    turn: np.ndarray,
+    sent: np.ndarray,
+    heard: np.ndarray,
+    window: tuple[float, float],
+) -> None:
+    """Add a path's template in place.
+
+    spectra[m, rx, i, p] += channels[tx, rx] turn[m, p] h(beat + sent + heard - i) exp(-j pi i
+    length / size), tx the antenna of the chirp, for i in [*rows), h the transform of the window
+    (`hann_response`) of `window` length and size [samples].
+    """
     length, size = window
-    share = length / size
-    num_chirps = spectra.shape[3]
-    near, sine, cosine = np.empty(num_chirps), np.empty(num_chirps), np.empty(num_chirps)
-    factor = np.empty(num_chirps, np.complex128)
-    for m in range(spectra.shape[0]):
-        for rx in range(spectra.shape[1]):
-            for p in range(num_chirps):
-                tx = schedule[m, p]
-                near[p] = (beat[m, p] + sent[tx] + heard[rx] - rows[0]) * share
-                sine[p], cosine[p] = np.sin(np.pi * near[p]), np.cos(np.pi * near[p])
-                factor[p] = channels[tx, rx] * turn[m, p] * (length / 2)
-            for i in range(rows[1] - rows[0]):
-                c, s = np.cos(np.pi * share * i), np.sin(np.pi * share * i)
-                angle = np.pi * share * (rows[0] + i)
-                back = complex(np.cos(angle), -np.sin(angle))
-                line = spectra[m, rx, rows[0] + i]
-                for p in range(num_chirps):
-                    d = near[p] - i * share
-                    if abs(abs(d) - 1.0) < 1e-6:
-                        shape = 0.5
-                    elif abs(d) < 1e-9:
-                        shape = 1.0
-                    else:
-                        shape = (sine[p] * c - cosine[p] * s) / (np.pi * d * (1.0 - d * d))
-                    line[p] += factor[p] * back * shape
+    row, share = np.arange(*rows)[:, None], length / size
+    back = np.exp(-1j * np.pi * share * row)
+    for rx in range(spectra.shape[1]):
+        place = (beat + sent[schedule] + heard[rx])[:, None]
+        d = (place - row) * share
+        hole = np.abs(np.abs(d) - 1) < 1e-6
+        safe = np.where(hole, 0.5, d)
+        shape = length / 2 * np.where(hole, 0.5, np.sinc(safe) / (1 - safe**2))
+        factor = channels[schedule, rx] * turn
+        spectra[:, rx, rows[0] : rows[1]] += factor[:, None] * back * shape

@@ -12,12 +12,14 @@ from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.jit import TWINS
 from isac_rt.kernels.receive_directions import REACH, TABLE_STEPS
+from isac_rt.kernels.receive_estimate import Chirps, WindowAxis
 from isac_rt.kernels.receive_maps import ROWS
-from isac_rt.kernels.vector import PART, aligned
-from isac_rt.receive import cfar, directions, estimate, maps, spectrum  # noqa: F401  # their twins
-from isac_rt.receive.clutter import covariance  # noqa: F401  # its twin
+from isac_rt.kernels.vector import LANES, PART, aligned
+from isac_rt.receive import cfar, directions, estimate, maps, pursuit, spectrum
+from isac_rt.receive.clutter import covariance
 from isac_rt.receive.known import Known
 
+TWINNED = cfar, covariance, estimate, pursuit, spectrum
 SINGLE = 3e-6  # float32 sums of some hundred numbers
 
 
@@ -144,3 +146,68 @@ def test_the_strongest_direction_of_an_arm(fine: bool):
     values = values + 0.1 * (rng.standard_normal((6, 3, 7, 2)) @ [1, 1j])
     args = values, apart, 0.97, 57, fine, np.zeros(6)
     assert_twins_agree("isac_rt.receive.estimate.fill_strongest", *args, rtol=1e-9)
+
+
+def local_rows(rng: np.random.Generator, rows: int) -> tuple[Chirps, WindowAxis]:
+    """Work space for `rows` rows of 20 receivers and 3 x 24 chirps, and a template's axis."""
+    size, blocks = 72, 2
+    weight, time = np.zeros((2, size + -size % LANES))
+    weight[:size], time[:size] = rng.uniform(0.2, 1, size), rng.uniform(-4e-3, 4e-3, size)
+    data = aligned(size * rows * blocks * 2 * LANES)
+    data[:] = rng.standard_normal(data.size)
+    tx = rng.integers(0, 3, size)
+    chirps = Chirps(data, rows, blocks, weight, time, tx, aligned(LANES * LANES))
+    return chirps, WindowAxis(77.1e9, 1.7e13, 1.3e-5, 2.1e-5, 230.0, 0.91, 17.0)
+
+
+@pytest.mark.parametrize("chirps", [24, 21])
+def test_rows_about_a_peak(chirps: int):
+    """Also a number of chirps that fills no vector. Planted bug in the kernel: the first row's turn
+    for all."""
+    rng = np.random.default_rng(9)
+    room, axis = local_rows(rng, 6)
+    room = room._replace(data=room.data[: 3 * chirps * 6 * 2 * 2 * LANES])
+    spectra = complex_noise(rng, 3, 20, 40, chirps)
+    by_kernel, by_twin = (room._replace(data=np.zeros_like(room.data)) for _ in range(2))
+    kernel, twin = TWINS["isac_rt.receive.estimate.gather"]
+    kernel(spectra, 17, axis.share, by_kernel)
+    twin(spectra, 17, axis.share, by_twin)
+    np.testing.assert_allclose(by_kernel.data, by_twin.data, rtol=0, atol=SINGLE)
+
+
+@pytest.mark.parametrize("rows", [7, 4])
+def test_matches_of_templates(rows: int):
+    """Planted bugs in the kernel: the window's middle left out of the beat; conjugated."""
+    rng = np.random.default_rng(10)
+    chirps, axis = local_rows(rng, rows)
+    delays = (17 + rng.uniform(1, 5, 4)) / (axis.slope * axis.duration)
+    out, energy = np.zeros((4, 3 * 2 * 2 * LANES), np.float32), np.zeros((4, 3))
+    args = chirps, axis, delays, rng.uniform(-3e-8, 3e-8, 4), out, energy
+    kernel, twin = TWINS["isac_rt.receive.estimate.match"]
+    kernel_out, kernel_energy, twin_out, twin_energy = (
+        a.copy() for a in (out, energy, out, energy)
+    )
+    kernel(*args[:4], kernel_out, kernel_energy)
+    twin(*args[:4], twin_out, twin_energy)
+    most = np.abs(twin_out).max()
+    # phases of 1e6 cycles are reduced in float64, in another order
+    np.testing.assert_allclose(kernel_out, twin_out, rtol=0, atol=1e-5 * most)
+    np.testing.assert_allclose(kernel_energy, twin_energy, rtol=1e-5)
+
+
+def test_a_template_added():
+    """Planted bugs in the kernel: the transmit antennas' delays left out; the turn from row to row
+    conjugated."""
+    rng, chirps = np.random.default_rng(11), 20
+    args = (
+        complex_noise(rng, 3, 4, 30, chirps),
+        (5, 24),
+        rng.standard_normal((3, 4, 2)) @ [1, 1j],
+        rng.integers(0, 3, (3, chirps)),
+        rng.uniform(12, 14, (3, chirps)),
+        np.exp(1j * rng.uniform(-3, 3, (3, chirps))),
+        rng.uniform(-0.1, 0.1, 3),
+        rng.uniform(-0.1, 0.1, 4),
+        (231.0, 256.0),
+    )
+    assert_twins_agree("isac_rt.receive.pursuit.add_template", *args, rtol=1e-6)

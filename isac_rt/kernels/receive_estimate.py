@@ -1,0 +1,191 @@
+"""Templates of paths in a few range rows: matched with the samples there, and added to them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from isac_rt.kernels.jit import jit
+from isac_rt.kernels.vector import (
+    LANES,
+    cos_sin_double,
+    cos_sin_exact,
+    floor,
+    load,
+    narrow,
+    not_above,
+    splat,
+    store,
+    transpose,
+)
+
+_NONE = np.float32(0)
+
+
+class Chirps(NamedTuple):
+    """Samples of `rows` range rows, float32: of each chirp and row the real and imaginary parts of
+    `blocks` times sixteen receivers; and of each chirp its weight, time [s] and antenna, the first
+    two filled up to a multiple of sixteen. `tile`: room for sixteen times sixteen."""
+
+    data: np.ndarray
+    rows: int
+    blocks: int
+    weight: np.ndarray
+    time: np.ndarray
+    tx: np.ndarray
+    tile: np.ndarray
+
+
+class WindowAxis(NamedTuple):
+    """What a template depends on of the waveform, the window's cells to a range cell, and the first
+    row."""
+
+    carrier: float
+    slope: float
+    middle: float
+    duration: float
+    length: float
+    share: float
+    first: float
+
+
+@jit(fast=True, borrows=True)
+def _square(flat, start, to_next, lanes, count, tile):
+    """Fill the tile with `count` complex values of each of `lanes` receivers, `to_next` apart from
+    `start` on, and turn it over: real and imaginary parts of one value of all receivers."""
+    if lanes < LANES or count < LANES // 2:
+        tile[:] = _NONE
+    for r in range(lanes):
+        at = start + r * to_next
+        if count == LANES // 2:
+            store(tile, LANES * r, load(flat, at))
+        else:
+            for i in range(2 * count):
+                tile[LANES * r + i] = flat[at + i]
+    transpose(tile, 0)
+
+
+@jit(fast=True, borrows=True)
+def gather(spectra, low, share, chirps):
+    """`isac_rt.receive.estimate.gather`, eight chirps of sixteen receivers at a time."""
+    groups, num_rx, num_rows, num_chirps = spectra.shape
+    flat, tile, out = spectra.reshape(-1).view(np.float32), chirps.tile, chirps.data
+    rows, blocks, to_next = chirps.rows, chirps.blocks, 2 * num_rows * num_chirps
+    for i in range(rows):
+        angle = np.pi * (low + i) * share
+        c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+        for m in range(groups):
+            for b in range(blocks):
+                lanes = min(LANES, num_rx - LANES * b)
+                start = (m * num_rx + LANES * b) * to_next + 2 * (low + i) * num_chirps
+                for p in range(0, num_chirps, LANES // 2):
+                    count = min(LANES // 2, num_chirps - p)
+                    _square(flat, start + 2 * p, to_next, lanes, count, tile)
+                    for q in range(count):
+                        re, im = load(tile, 2 * LANES * q), load(tile, 2 * LANES * q + LANES)
+                        to = (((m * num_chirps + p + q) * rows + i) * blocks + b) * 2 * LANES
+                        store(out, to, c * re - s * im)
+                        store(out, to + LANES, s * re + c * im)
+
+
+@jit(fast=True, borrows=True)
+def _template(chirps, axis, first, delay, delay_rate, steps, out):
+    """Of a path in the sixteen chirps from `first` on, sixteen float32 each: weighted cosine and
+    sine, weight times the sum of the rows' squared factors, and the rows' real factors. Beat, phase
+    and `hann_response`; a test holds them against these. `steps` : cosine and sine from the first
+    row to each."""
+    carrier, slope, middle, duration, length, share, low = axis
+    weight, tau = narrow(load(chirps.weight, first)), delay + delay_rate * load(chirps.time, first)
+    near = (slope * tau + delay_rate * (carrier + slope * (middle - tau))) * duration
+    near = (near - low) * share
+    turns, chirp, half = carrier * tau, slope * tau * (middle - 0.5 * tau), 0.5 * near
+    cycles = turns - floor(turns) + chirp - floor(chirp)
+    c, s = cos_sin_exact(cycles - floor(cycles + 0.5))
+    store(out, 0, weight * c)
+    store(out, LANES, weight * s)
+    c, s = cos_sin_double(half - floor(half + 0.5))
+    energy = splat(_NONE)
+    for k in range(chirps.rows):
+        d = near - k * share
+        value, under = s * steps[0, k] - c * steps[1, k], np.pi * d * (1.0 - d * d)
+        # at its middle and at the ends of its lobe the quotient is 1 and 1/2
+        at_hole, inside = not_above(under * under, splat(1e-16)), not_above(d * d, splat(0.25))
+        value = value + at_hole * (0.5 + 0.5 * inside - value)
+        under = under + at_hole * (1.0 - under)
+        factor = np.float32(length / 2) * (narrow(value) / narrow(under))
+        store(out, (3 + k) * LANES, factor)
+        energy = energy + factor * factor
+    store(out, 2 * LANES, weight * energy)
+
+
+@jit(inline=True)
+def _add_chirp(chirps, chirp, template, lane, out, to):
+    """Add to out[to:] conj(template) times the data of a chirp, which has that lane of the
+    template."""
+    rows, data = chirps.rows, chirps.data
+    line = 2 * LANES * chirps.blocks
+    c, s = template[lane], template[LANES + lane]
+    for start in range(0, line, 2 * LANES):
+        at = chirp * rows * line + start
+        re, im = splat(_NONE), splat(_NONE)
+        for k in range(rows):
+            factor = template[(3 + k) * LANES + lane]
+            re = re + factor * load(data, at)
+            im = im + factor * load(data, at + LANES)
+            at += line
+        store(out, to + start, load(out, to + start) + c * re + s * im)
+        store(out, to + start + LANES, load(out, to + start + LANES) + c * im - s * re)
+
+
+@jit(fast=True)
+def match(chirps, axis, delays, delay_rates, out, energy):
+    """`isac_rt.receive.estimate.match`, sixteen chirps of a template at a time."""
+    angle = np.pi * axis.share * np.arange(chirps.rows)
+    steps = np.stack((np.cos(angle), np.sin(angle)))  # from the first row to each
+    _add_matches(chirps, axis, delays, delay_rates, steps, out, energy)
+
+
+@jit(fast=True, borrows=True)
+def _add_matches(chirps, axis, delays, delay_rates, steps, out, energy):
+    """`match`, with the `steps` of `_template`; `out` (K, antennas * line) float32."""
+    flat, line, template = out.reshape(-1), 2 * LANES * chirps.blocks, chirps.tile
+    for first in range(0, chirps.tx.size, LANES):
+        for j in range(delays.size):
+            _template(chirps, axis, first, delays[j], delay_rates[j], steps, template)
+            for i in range(min(LANES, chirps.tx.size - first)):
+                tx = chirps.tx[first + i]
+                energy[j, tx] += template[2 * LANES + i]
+                to = j * out.shape[1] + tx * line
+                _add_chirp(chirps, first + i, template, i, flat, to)
+
+
+@jit
+def add_template(spectra, rows, channels, schedule, beat, turn, sent, heard, window):
+    """`isac_rt.receive.pursuit.add_template`."""
+    length, size = window
+    share = length / size
+    num_chirps = spectra.shape[3]
+    near, sine, cosine = np.empty(num_chirps), np.empty(num_chirps), np.empty(num_chirps)
+    factor = np.empty(num_chirps, np.complex128)
+    for m in range(spectra.shape[0]):
+        for rx in range(spectra.shape[1]):
+            for p in range(num_chirps):
+                tx = schedule[m, p]
+                near[p] = (beat[m, p] + sent[tx] + heard[rx] - rows[0]) * share
+                sine[p], cosine[p] = np.sin(np.pi * near[p]), np.cos(np.pi * near[p])
+                factor[p] = channels[tx, rx] * turn[m, p] * (length / 2)
+            for i in range(rows[1] - rows[0]):
+                c, s = np.cos(np.pi * share * i), np.sin(np.pi * share * i)
+                angle = np.pi * share * (rows[0] + i)
+                back = complex(np.cos(angle), -np.sin(angle))
+                line = spectra[m, rx, rows[0] + i]
+                for p in range(num_chirps):
+                    d = near[p] - i * share
+                    if abs(abs(d) - 1.0) < 1e-6:
+                        shape = 0.5
+                    elif abs(d) < 1e-9:
+                        shape = 1.0
+                    else:
+                        shape = (sine[p] * c - cosine[p] * s) / (np.pi * d * (1.0 - d * d))
+                    line[p] += factor[p] * back * shape
