@@ -124,6 +124,7 @@ def _reception(w, rng, truth, maps, decoded, detections):
         snr=rng.uniform(20, 400, detections),
         std=np.full((detections, 4), 0.07),
         is_reference=np.zeros(detections, bool),
+        starts=np.ones(detections, bool),
     )
     none = np.full((1, 1), -1)
     return Reception(

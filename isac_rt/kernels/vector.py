@@ -10,7 +10,6 @@ is one.
 from __future__ import annotations
 
 import operator
-from contextlib import suppress
 from math import factorial
 
 import numpy as np
@@ -391,34 +390,6 @@ def aligned(size: int) -> np.ndarray:
     out = unset(size)
     out[:] = 0
     return out
-
-
-_SPARE: list[np.ndarray] = []
-_MOST_SPARE = 3
-
-
-class _Lent:
-    """Memory of an array; it is kept for the next one once no array refers to it any more."""
-
-    def __init__(self, memory: np.ndarray) -> None:
-        self._memory, self.__array_interface__ = memory, memory.__array_interface__
-
-    def __del__(self) -> None:
-        _SPARE.append(self._memory)
-        del _SPARE[:-_MOST_SPARE]
-
-
-def lent_memory(shape: tuple[int, ...]) -> np.ndarray:
-    """Complex64 of any values, in the memory of a former array of this shape where one is no longer
-    in use: new pages are cleared by the system first, which takes as long as writing them (a fifth
-    of a floor for a full frame)."""
-    for _ in range(len(_SPARE)):
-        with suppress(IndexError):  # another thread was faster
-            memory = _SPARE.pop(0)
-            if memory.shape == shape:
-                return np.asarray(_Lent(memory))
-            _SPARE.append(memory)
-    return np.asarray(_Lent(new_memory(shape)))
 
 
 def new_memory(shape: tuple[int, ...]) -> np.ndarray:

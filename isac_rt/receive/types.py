@@ -60,7 +60,7 @@ class Detections:
     std : (Q, 4) standard deviations of range, velocity, u_x, u_z; infinite on an axis that the
         array does not observe
     is_reference : (Q,) bool, the line of sight at a PT
-    starts : (Q,) bool, whether it may start a track; the others only carry on one. By default all
+    starts : (Q,) bool, whether it may start a track; the others only carry on one
 
     Examples
     --------
@@ -75,11 +75,9 @@ class Detections:
     snr: np.ndarray
     std: np.ndarray
     is_reference: np.ndarray
-    starts: np.ndarray = field(default_factory=lambda: np.ones(0, bool))
+    starts: np.ndarray
 
     def __post_init__(self) -> None:
-        if self.starts.size != self.range.size:
-            object.__setattr__(self, "starts", np.ones(self.range.size, bool))
         for a in vars(self).values():
             a.setflags(write=False)
 
@@ -127,6 +125,7 @@ def no_detections() -> Detections:
         snr=np.zeros(0),
         std=np.zeros((0, 4)),
         is_reference=np.zeros(0, bool),
+        starts=np.ones(0, bool),
     )
 
 

@@ -37,9 +37,9 @@ from isac_rt.kernels.vector import (
     cos_sin,
     cos_sin_exact,
     floor,
-    lent_memory,
     load,
     narrow,
+    new_memory,
     splat,
     store,
     stream,
@@ -789,7 +789,7 @@ def range_cells(
     middle = start + length / 2 - w.num_samples // 2
     one = np.ones(start.size)
     shape = (w.num_groups, tones.rx_delay.shape[1], w.num_chirps, w.num_samples)
-    out = lent_memory((*shape[:2], num_cells, w.num_chirps))
+    out = new_memory((*shape[:2], num_cells, w.num_chirps))
     cycles = delay_symbols.ravel() * (start + length / 2) / w.num_samples + np.ravel(
         w.data_phase(delay_symbols)
     )

@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from isac_rt.frame.waveform import Waveform
-from isac_rt.kernels.vector import lent_memory
+from isac_rt.kernels.vector import new_memory
 from isac_rt.propagation.clutter.merging import resolution_cell
 from isac_rt.signal.choice import CANDIDATES, DIRECT, SHIPPED, CostModel, Cover, read
 from isac_rt.signal.covered import covered_error, summed_share
@@ -214,7 +214,7 @@ def _cover(waveform: Waveform, tones: Tones) -> Cover:
 
 def _made(waveform: Waveform, tones: Tones, noise: WhiteNoise, choice: Choice) -> np.ndarray:
     """Samples with some paths made one by one, the others through a grid, and noise."""
-    samples = lent_memory(_shape(waveform, tones))
+    samples = new_memory(_shape(waveform, tones))
     setting, alone, faint = choice
     strong = tones.select(alone)
     if alone.all():

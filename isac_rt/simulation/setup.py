@@ -219,27 +219,29 @@ class Setup:
     seconds: Seconds = NONE
     """What `prepare` took."""
 
-    def __post_init__(self) -> None:
-        """With other antennas than those of its paths a set-up finds its paths anew: what
-        `dataclasses.replace` makes is whole."""
-        if self.antennas == self.reference.antennas:
-            return
-        if self.antennas.num_tx != self.waveform.num_tx:
+    def with_antennas(self, antennas: Antennas) -> Setup:
+        """The same with other antennas, whose paths are found anew.
+
+        Raises
+        ------
+        ValueError  If they are not of the waveform's transmit antennas.
+        """
+        if antennas.num_tx != self.waveform.num_tx:
             raise ValueError(
                 f"the waveform is of {self.waveform.num_tx} transmit antennas, the array has "
-                f"{self.antennas.num_tx}; prepare a scenario with this array"
+                f"{antennas.num_tx}; prepare a scenario with this array"
             )
-        free = replace(self.reference, antennas=self.antennas)
-        plan = replace(self.plan, antennas=self.antennas)
+        free = replace(self.reference, antennas=antennas)
+        plan = replace(self.plan, antennas=antennas)
         floor = noise_floor(self.scenario, plan, free)
-        anew = {
-            "reference": free,
-            "plan": plan,
-            "propagation": _maker(self.scenario, plan, free, self.city, floor)(),
-            "expectation": _expectation_of(self.scenario, plan, free, self.city),
-        }
-        for name, value in anew.items():
-            object.__setattr__(self, name, value)
+        return replace(
+            self,
+            antennas=antennas,
+            reference=free,
+            plan=plan,
+            propagation=_maker(self.scenario, plan, free, self.city, floor)(),
+            expectation=_expectation_of(self.scenario, plan, free, self.city),
+        )
 
     @property
     def schedule(self) -> Schedule:

@@ -36,6 +36,7 @@ def found(ranges, snr, reference=None) -> Detections:
         snr=np.array(snr, float),
         std=np.array([[0.01, 0.2, 0.003, 0.004]]) * (1 + np.arange(count))[:, None],
         is_reference=np.arange(count) == (-1 if reference is None else reference),
+        starts=np.ones(count, bool),
     )
 
 

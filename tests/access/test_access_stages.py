@@ -105,6 +105,7 @@ class Air:
                 snr=99 * one,
                 std=np.array([[0.01, 0.1, 1e-3, 1e-3]]),
                 is_reference=one > 0,
+                starts=np.ones(1, bool),
             )
             return Reception.undecoded(W, found)
 

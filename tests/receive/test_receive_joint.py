@@ -844,6 +844,7 @@ def test_two_detections_of_one_path_leave_the_others_alone():
         snr=np.full(3, 100.0),
         std=np.ones((3, 4)),
         is_reference=np.zeros(3, bool),
+        starts=np.ones(3, bool),
     )
     out, power = refine_jointly(Moments(got, known(w, schedule, payload, FEW)), d)
     assert power[2] == pytest.approx(1, rel=0.02)  # noise is 10 dB under a sample

@@ -35,6 +35,7 @@ def detections(rows) -> Detections:
         snr=np.ones(len(z)),
         std=np.ones((len(z), 4)),
         is_reference=np.zeros(len(z), bool),
+        starts=np.ones(len(z), bool),
     )
 
 

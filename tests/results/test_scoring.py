@@ -107,6 +107,7 @@ def detections(points) -> Detections:
         snr=np.full(len(z), 50.0),
         std=np.full((len(z), 4), 0.1),
         is_reference=np.zeros(len(z), bool),
+        starts=np.ones(len(z), bool),
     )
 
 

@@ -16,7 +16,7 @@ from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.kernels.fourier import ROW, plan, transform
-from isac_rt.kernels.vector import aligned, cos_sin, cos_sin_exact, lent_memory, load, store
+from isac_rt.kernels.vector import aligned, cos_sin, cos_sin_exact, load, store
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.signal.covered import LINES, TOGETHER, batches, covered_error
 from isac_rt.signal.direct import add_direct
@@ -90,19 +90,6 @@ def test_cosine_and_sine_for_the_direct_method():
     truth = np.exp(2j * np.pi * cycles)
     assert np.abs(c.astype(float) - truth.real).max() < 3.1e-8  # half an ulp below 1, and 1e-10
     assert np.abs(s.astype(float) - truth.imag).max() < 3.1e-8
-
-
-def test_memory_is_lent_again_only_when_nothing_refers_to_it():
-    """Planted bug: memory kept for the next when the first array goes, whatever views are left."""
-    shape = (2, 3, 5, 7)
-    first = lent_memory(shape)
-    where, view = first.ctypes.data, first[1]
-    del first
-    second = lent_memory(shape)
-    assert second.ctypes.data != where
-    del view
-    assert lent_memory(shape).ctypes.data == where
-    assert lent_memory((2, 3, 5, 8)).shape == (2, 3, 5, 8)
 
 
 def scene(count, rng, speed=15.0, view=60.0, **change):

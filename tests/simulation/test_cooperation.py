@@ -208,6 +208,7 @@ def test_a_reference_is_not_told_as_a_detection():
         snr=np.full(2, 80.0),
         std=np.full((2, 4), 0.01),
         is_reference=np.zeros(2, bool),
+        starts=np.ones(2, bool),
     )
     waveform = Waveform(num_samples=256)
     heard = Heard(Reception.undecoded(waveform, found), track_set(tracks[:1], own, tracks[1]), 1)

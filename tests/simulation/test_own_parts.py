@@ -67,18 +67,17 @@ def test_other_antennas_find_other_paths():
     back, a line of sight too, and the reference with them; other places other samples. Bug: the
     paths of the old antennas."""
     setup = prepare(load(TREE))
-    louder = replace(setup, antennas=replace(setup.antennas, gain=4 * setup.antennas.gain))
+    louder = setup.with_antennas(replace(setup.antennas, gain=4 * setup.antennas.gain))
     for link in (("AT", "AT"), ("AT", "PT")):
         before, after = (s.frame(0).paths[link] for s in (setup, louder))
         assert after.gain == pytest.approx(4 * before.gain)
     assert louder.plan.antennas is louder.antennas
-    row = replace(
-        setup,
-        antennas=Antennas.placed(setup.antennas.tx_positions[:, [0, 2]], [(0, 0), (0.002, 0)]),
+    row = setup.with_antennas(
+        Antennas.placed(setup.antennas.tx_positions[:, [0, 2]], [(0, 0), (0.002, 0)])
     )
     assert row.frame(0).samples(("AT", "PT")).samples.shape[1] == 2
     with pytest.raises(ValueError, match="of 3 transmit antennas, the array has 1"):
-        replace(setup, antennas=Antennas.placed([(0, 0)], [(0, 0)]))
+        setup.with_antennas(Antennas.placed([(0, 0)], [(0, 0)]))
 
 
 class Standard:

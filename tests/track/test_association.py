@@ -257,6 +257,7 @@ def marked(z, std):
         snr=100.0 + np.arange(len(z)),
         std=std,
         is_reference=np.zeros(len(z), bool),
+        starts=np.ones(len(z), bool),
     )
 
 

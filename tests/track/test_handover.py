@@ -61,6 +61,7 @@ def found(rows, reference: int | None = None, snr: float = 50.0, std=STD) -> Det
         snr=snr + np.arange(len(z)),
         std=np.tile(std, (len(z), 1)),
         is_reference=np.arange(len(z)) == (-1 if reference is None else reference),
+        starts=np.ones(len(z), bool),
     )
 
 

@@ -185,6 +185,7 @@ def detections(range_: list[float], velocity: list[float], u_x: list[float]) -> 
         snr=np.full(count, 40.0),
         std=np.tile([0.01, 0.01, 2e-3, 2e-3], (count, 1)),
         is_reference=np.zeros(count, bool),
+        starts=np.ones(count, bool),
     )
 
 

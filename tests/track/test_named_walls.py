@@ -132,6 +132,7 @@ def test_a_terminal_that_is_told_of_others_waits_for_their_word(word, first, mon
         snr=np.full(1, 50.0),
         std=np.array([[0.03, 0.08, 0.005, 0.006]]),
         is_reference=np.zeros(1, bool),
+        starts=np.ones(1, bool),
     )
     monkeypatch.setattr(terminal, "_expected_clutter", lambda own: _raise(Asked))
     with pytest.raises(Asked):  # nothing is received here

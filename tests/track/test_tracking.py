@@ -53,6 +53,7 @@ def detections(z: np.ndarray, std: np.ndarray = STD, snr: float = 50.0) -> Detec
         snr=np.full(len(z), snr),
         std=np.tile(std, (len(z), 1)),
         is_reference=np.zeros(len(z), bool),
+        starts=np.ones(len(z), bool),
     )
 
 

@@ -256,6 +256,7 @@ def _described(
         snr=1 + snr,
         std=np.hypot(std, floor),
         is_reference=np.zeros(len(found), bool),
+        starts=np.ones(len(found), bool),
     )
 
 

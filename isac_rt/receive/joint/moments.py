@@ -26,7 +26,7 @@ from numpy.polynomial import Chebyshev
 from scipy.special import i0
 
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import LANES, lent_memory
+from isac_rt.kernels.vector import LANES, new_memory
 from isac_rt.receive.joint.tones import Tones, Weights
 from isac_rt.receive.known import Known
 from isac_rt.receive.transform import transform
@@ -75,7 +75,7 @@ class Moments:
         turn = np.exp(2j * np.pi * (np.arange(size) * (length // 2) % size) / size)
         turns = np.repeat(turn.astype(np.complex64)[:, None], lanes, axis=1)
         padded = np.zeros((num_chirps, lanes, size), np.complex64)
-        out = lent_memory((num_groups, num_chirps, size, lanes))
+        out = new_memory((num_groups, num_chirps, size, lanes))
         for group, made in zip(self._samples, out, strict=True):  # receivers in the place of chirps
             padded[:, :num_rx, :length] = group.swapaxes(0, 1)
             transform(padded, factor, np.arange(size), made, turn=turns)

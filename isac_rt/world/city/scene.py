@@ -10,14 +10,9 @@ Import only after `isac_rt.runtime.activate()`: Sionna and Mitsuba start the JIT
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
@@ -94,45 +89,6 @@ def shared_scenes(city: CityMesh, carrier_frequency: float) -> CityScenes:
     return found
 
 
-VIEWERS = {
-    "sionna.rt.preview": "Previewer",
-    "sionna.rt.rcs.scattering_model_viewer": "ScatteringModelViewer",
-}
-"""Modules of Sionna RT that show things in a notebook, and what the others take of each."""
-
-
-class _Later(ModuleType):
-    """Stands for a module that is loaded when something of it is used."""
-
-    def __getattr__(self, name: str) -> Any:
-        if sys.modules.get(self.__name__) is self:
-            raise AttributeError(name)
-        return getattr(import_module(self.__name__), name)
-
-
-def _later(module: str, name: str) -> Callable[..., Any]:
-    """A class of a module that is loaded when it is called."""
-    return lambda *a, **k: getattr(import_module(module), name)(*a, **k)
-
-
-@contextmanager
-def _without_viewers() -> Iterator[None]:
-    """Load Sionna RT without what draws its scenes, a notebook's widgets and pyplot: two thirds of
-    its time. Of pyplot its annotations name one thing."""
-    stand_ins = {name: _Later(name) for name in ("matplotlib.pyplot", *VIEWERS)}
-    vars(stand_ins["matplotlib.pyplot"])["Figure"] = Any
-    for module, name in VIEWERS.items():
-        vars(stand_ins[module])[name] = _later(module, name)
-    missing = [name for name in stand_ins if name not in sys.modules]
-    sys.modules.update({name: stand_ins[name] for name in missing})
-    try:
-        yield
-    finally:
-        for name in missing:
-            del sys.modules[name]
-
-
-@_without_viewers()
 def build_scene(city: CityMesh, carrier_frequency: float) -> SceneHandle:
     """Sionna scene of a city, new.
 
