@@ -140,7 +140,10 @@ class _Reader:
 
     def _mapping(self, node: yaml.MappingNode, key: Key, depth: int) -> dict[str, Any]:
         values: dict[str, Any] = {}
+        merged = self._merged(node, key, depth)
         for name, item in node.value:
+            if _merges(name):
+                continue
             if not isinstance(name, yaml.ScalarNode):
                 raise _fault(name, "a key must be a word")
             below = (*key, name.value)
@@ -150,7 +153,26 @@ class _Reader:
                 raise _fault(name, f"the key {dotted(below)} {said}")
             self.places[below] = self._place or name.start_mark.line + 1
             values[name.value] = self._value(item, below, depth + 1)
-        return values
+        return merged | values
+
+    def _merged(self, node: yaml.MappingNode, key: Key, depth: int) -> dict[str, Any]:
+        """What a mapping takes over by its key `<<` from others; the first of a list wins."""
+        merged: dict[str, Any] = {}
+        for name, item in node.value:
+            if not _merges(name):
+                continue
+            sources = item.value if isinstance(item, yaml.SequenceNode) else [item]
+            for source in sources:
+                values = self._value(source, key, depth + 1)
+                if not isinstance(values, dict):
+                    raise _fault(source, "what << takes over must be a mapping, such as *name")
+                merged = values | merged
+        return merged
+
+
+def _merges(name: yaml.Node) -> bool:
+    """Whether a key is YAML's `<<`."""
+    return isinstance(name, yaml.ScalarNode) and name.value == "<<" and not name.style
 
 
 def _plain(value: Any, key: Key, depth: int) -> Any:

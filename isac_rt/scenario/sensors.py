@@ -108,9 +108,11 @@ SENSORS: dict[str, dict[str, dict[str, Any]]] = {
 def with_sensor(stated: dict[str, Any]) -> dict[str, Any]:
     """What a file states, with what its `sensor` says of the rest. What is malformed stays as it
     is, for whoever checks it."""
-    name = stated.get("sensor")
-    said = SENSORS.get(name, {}) if isinstance(name, str) else {}
-    out = dict(stated)
+    name, out = stated.get("sensor"), dict(stated)
+    if not isinstance(name, str) or name.lower() not in SENSORS:
+        return out
+    out["sensor"] = name.lower()
+    said = SENSORS[name.lower()]
     for key, values in said.items():
         own = stated.get(key, {})
         if isinstance(own, dict):

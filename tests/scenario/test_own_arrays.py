@@ -131,6 +131,7 @@ def test_sensors_are_consistent_and_can_be_overridden(tmp_path, name):
     scene = SCENE.replace("radio: {mode: fmcw, carrier_hz: 60.0e+9, chirps_per_frame: 48}\n", "")
     (tmp_path / "scene.yaml").write_text(scene)
     s = load(tmp_path / "scene.yaml", [f"sensor={name}", "noise.noise_figure_db=9"])
+    assert s == load(tmp_path / "scene.yaml", [f"sensor={name.upper()}", "noise.noise_figure_db=9"])
     low, high = {"a": (76e9, 81e9), "i": (60e9, 64e9), "b": (24e9, 24.25e9)}[name[0]]
     assert low <= s.radio.carrier_hz and s.radio.carrier_hz + s.radio.bandwidth_hz <= high
     assert (s.noise.noise_figure_db, s.radio.mode) == (9, "fmcw")

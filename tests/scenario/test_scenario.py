@@ -294,6 +294,33 @@ def test_alias_bombs_are_bounded(complaint):
     assert "more than 200000 values" in complaint(bomb)
 
 
+def test_a_mapping_takes_over_what_another_holds(tmp_path):
+    """YAML's `<<`: own keys win, then the first of a list, wherever it stands. Planted bug: what is
+    taken over wins."""
+    (tmp_path / "s.yaml").write_text(
+        "swarm:\n  A: &a {role: active, position_m: [0, 0, 9], velocity_mps: [1, 2, 0]}\n"
+        "  B: &b {<<: *a, role: target, position_m: [5, 5, 9]}\n"
+        "  C: {role: target, position_m: [7, 7, 9], <<: [*b, *a]}\n"
+        "  D: {role: target, position_m: [9, 7, 9], velocity_mps: [3, 0, 0], <<: {rcs: {}}}\n"
+    )
+    swarm = load(tmp_path / "s.yaml").swarm
+    assert [uav.role for uav in swarm.values()] == ["active", "target", "target", "target"]
+    assert [uav.velocity_mps for uav in swarm.values()] == [(1, 2, 0)] * 3 + [(3, 0, 0)]
+    assert swarm["C"].position_m == (7, 7, 9)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a: 1\n<<: 2\n", "s.yaml:2: what << takes over must be a mapping"),
+        ("a: &a {<<: *a}\n", "more than 40 levels"),
+        ('"<<": {}\n', "<<"),
+    ],
+)
+def test_what_cannot_be_taken_over(complaint, text, said):
+    assert said in complaint(text)
+
+
 @pytest.mark.parametrize("second", [{"position_m": "[9, 9, 9]"}, {"velocity_mps": "[1, 0, 0]"}])
 def test_waypoints_stand_alone(complaint, second):
     points = "[{time_s: 0, position_m: [9, 9, 9]}, {time_s: 1.5, position_m: [9, 9, 8]}]"

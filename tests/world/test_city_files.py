@@ -540,6 +540,16 @@ def test_hostile_scenes_end_in_one_message(name, traps):
     assert complaint(traps, "mitsuba", "scene.xml")
 
 
+def test_a_scene_that_windows_wrote_names_its_files(tmp_path):
+    (tmp_path / "mesh").mkdir()
+    (tmp_path / "mesh/box.ply").write_bytes(BOX.export(file_type="ply"))
+    (tmp_path / "scene.xml").write_text(scene(SHAPE.format("ply", "mesh\\box.ply", "")))
+    found = city(tmp_path, "mitsuba", "scene.xml")
+    assert len(found.faces) == len(BOX.faces)
+    (tmp_path / "scene.xml").write_text(scene(SHAPE.format("ply", "..\\box.ply", "")))
+    assert "outside its folder" in complaint(tmp_path, "mitsuba", "scene.xml")
+
+
 @pytest.mark.parametrize("source", ["mesh", "mitsuba", "footprints"])
 @pytest.mark.parametrize("name", ["pipe.ply", ".", "/dev/zero", "nothing.ply", "a\0b", "x" * 5000])
 def test_what_is_no_file_is_refused(source, name, traps):

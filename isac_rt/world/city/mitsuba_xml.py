@@ -208,7 +208,7 @@ def _mesh_path(reader: _Reader, shape: ET.Element) -> Path:
     node = shape.find("string[@name='filename']")
     if node is None:
         raise CityError(f"{reader.path.name}: {what} has no filename; give it one")
-    name = reader.text(node, "value") or ""
+    name = (reader.text(node, "value") or "").replace("\\", "/")  # as Windows writes it
     if name not in reader.beside:
         reader.beside[name] = beside(reader.path, name, what)
     return reader.beside[name]
