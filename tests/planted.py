@@ -354,7 +354,7 @@ OF_CASES = {
         "resample = np.eye(len(times))",
     ),
     "orthogonal matching pursuit": Bug(
-        "receive/omp.py",
+        "kernels/receive_omp.py",
         "re, im = re - a * c - b * d, im - b * c + a * d",
         "re, im = re - a * c + b * d, im - b * c - a * d",
     ),
@@ -381,7 +381,7 @@ OF_CASES = {
         "return count / 9 if count else 0.0",
     ),
     "bias of an echo": Bug(
-        "receive/estimate.py",
+        "kernels/receive_estimate.py",
         "near = (slope * tau + delay_rate * (carrier + slope * (middle - tau))) * duration",
         "near = (slope * tau - delay_rate * (carrier + slope * (middle - tau))) * duration",
     ),

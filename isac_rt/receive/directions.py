@@ -222,12 +222,14 @@ def search_plain(x: np.ndarray, search: Search, noise: float, least: float) -> F
             bound += np.sqrt(line_bounds(flat, looks + members, spectra))
     cell = np.flatnonzero(bound**2 * raised >= least)
     y = np.ascontiguousarray(x[:, :, cell].transpose(2, 0, 1))
-    # of each line the best direction, then of all lines along an axis one
-    amplitudes = [
-        np.sqrt((f.real**2 + f.imag**2).sum(axis=1)).sum(axis=1).max(axis=1)
-        for f in search.lines(y)
-    ]
-    peak, cosines = sum(amplitudes) ** 2 * raised, np.full((cell.size, 2), np.nan)
+    peak, cosines = bound[cell] ** 2 * raised, np.full((cell.size, 2), np.nan)
+    if max(len(lines.members) for lines in (search.along_x, search.along_z)) > 1:
+        # of each line the best direction before, of all lines along an axis one here
+        amplitudes = [
+            np.sqrt((f.real**2 + f.imag**2).sum(axis=1)).sum(axis=1).max(axis=1)
+            for f in search.lines(y)
+        ]
+        peak = (amplitudes[0] + amplitudes[1]) ** 2 * raised
     some = np.flatnonzero(peak >= least)
     y = y[some]
     whole = np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32)

@@ -8,8 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import LANES, evens, larger, load, odds, splat, store
+from isac_rt.kernels import receive_omp
+from isac_rt.kernels.jit import twin_of
+from isac_rt.kernels.receive_omp import RIDGE
+from isac_rt.kernels.vector import LANES
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import LatinUnion, Levels
 
@@ -18,9 +20,6 @@ SPARSITY = 4
 MOST_UNEXPLAINED = 1 / 3
 """Of a sparse row's power above the noise, what OMP with as many atoms as it recovers dependably
 may leave."""
-RIDGE = 1e-9
-"""Of an atom's energy, added to it: few or evenly spaced samples do not tell all atoms apart, and
-alike ones share an amplitude then."""
 
 
 def recovery_limit(num_samples: int, num_chirps: int) -> int:
@@ -148,7 +147,7 @@ def pursued(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: 
     first = np.asarray(vectors, np.complex64) @ analysis
     support = np.empty((len(vectors), sparsity), np.int64)
     amplitude = np.empty((len(vectors), sparsity), np.complex128)
-    _pursue(first, *gram, support, amplitude)
+    fill_atoms(first, *gram, support, amplitude)
     matched = np.take_along_axis(first, support, axis=1)
     explained = (matched.conj() * amplitude).real.sum(axis=1)
     return Pursued(support, amplitude * chosen.size, explained)
@@ -165,80 +164,34 @@ def _dictionary(chosen: tuple[int, ...], num_chirps: int) -> tuple[np.ndarray, n
     return analysis, np.stack([gram.real, gram.imag])
 
 
-@jit(fast=True)
-def _pursue(first, gram_re, gram_im, support, amplitude):
-    """Fill `support` and `amplitude` from the correlations `first` (V, P and what fills vectors);
-    `gram` is that of an atom and the one k bins on, for k in [0, 3 P). Atoms are chosen in
-    float32."""
-    sparsity, power = support.shape[1], np.empty(first.shape[1], np.float32)
-    lanes = np.empty(LANES, np.float32)
-    short = gram_re.astype(np.float32), gram_im.astype(np.float32)
-    lower = np.empty((sparsity, sparsity), np.complex128)
-    forward, parts = np.empty(sparsity, np.complex128), first.view(np.float32)
-    for v in range(first.shape[0]):
-        chosen, x = support[v], amplitude[v]
-        for k in range(sparsity):
-            _powers(parts[v], short, chosen[:k], x, power)
-            chosen[k] = _largest(power, lanes)
-            _fit(first[v], chosen[: k + 1], gram_re, gram_im, lower, forward, x)
+@twin_of(receive_omp.pursue)
+def fill_atoms(
+    first: np.ndarray,
+    gram_re: np.ndarray,
+    gram_im: np.ndarray,
+    support: np.ndarray,
+    amplitude: np.ndarray,
+) -> None:
+    """Fill `support` and `amplitude` (V, sparsity) from the correlations `first` (V, P and what
+    fills vectors): the atom of most residual correlation, then the least squares of all so far.
 
-
-@jit(fast=True, borrows=True)
-def _powers(first, short, chosen, x, power):
-    """Of all bins the correlation's square once the atoms `chosen`, of amplitudes x, are out; -1
-    where they lie and after the last bin. `short` is the Gram in float32."""
-    (gram_re, gram_im), num_chirps = short, short[0].size // 3
-    for p in range(0, power.size, LANES):
-        a, b = load(first, 2 * p), load(first, 2 * p + LANES)
-        re, im = evens(a, b), odds(a, b)
-        for i in range(chosen.size):  # the correlation with bin p is the Gram's conjugate
-            a, b = splat(np.float32(x[i].real)), splat(np.float32(x[i].imag))
-            at = num_chirps - chosen[i] + p
-            c, d = load(gram_re, at), load(gram_im, at)
-            re, im = re - a * c - b * d, im - b * c + a * d
-        store(power, p, re * re + im * im)
-    power[num_chirps:] = -1.0
-    for bin in chosen:
-        power[bin] = -1.0
-
-
-@jit(borrows=True)
-def _largest(power, lanes):
-    """The first number of the largest."""
-    most = load(power, 0)
-    for p in range(LANES, power.size, LANES):
-        most = larger(most, load(power, p))
-    store(lanes, 0, most)
-    highest, found = lanes[0], 0
-    for value in lanes:
-        highest = max(highest, value)
-    while power[found] < highest:
-        found += 1
-    return found
-
-
-@jit(fast=True, borrows=True)
-def _fit(first, chosen, gram_re, gram_im, lower, forward, x):
-    """Least-squares amplitudes x of the atoms `chosen`; `lower` and `forward` are Cholesky's of all
-    but the last atom, and become those of all. The diagonal of `lower` has the reciprocals: a
-    division costs as much as ten products."""
-    k, num_chirps = chosen.size - 1, gram_re.size // 3
-    left, value = gram_re[0] * (1.0 + RIDGE), first[chosen[k]]
-    for i in range(k):
-        at = chosen[i] - chosen[k] + num_chirps
-        inner = complex(gram_re[at], gram_im[at])
-        for j in range(i):
-            inner -= lower[k, j] * lower[i, j].conjugate()
-        lower[k, i] = inner * lower[i, i].real
-        left -= lower[k, i].real ** 2 + lower[k, i].imag ** 2
-        value -= lower[k, i] * forward[i]
-    lower[k, k] = 1 / np.sqrt(max(left, gram_re[0] * RIDGE))
-    forward[k] = value * lower[k, k].real
-    for i in range(k, -1, -1):
-        value = forward[i]
-        for j in range(i + 1, k + 1):
-            value -= lower[j, i].conjugate() * x[j]
-        x[i] = value * lower[i, i].real
+    `gram_re` and `gram_im` are the parts of the product of an atom and the one k bins on, for k in
+    [0, 3 P).
+    """
+    gram = gram_re + 1j * gram_im
+    num_chirps, each = gram.size // 3, np.arange(len(first))[:, None]
+    bins, correlation = np.arange(num_chirps), first[:, : gram.size // 3]
+    for k in range(support.shape[1]):
+        chosen = support[:, :k]
+        left = gram[num_chirps - chosen[..., None] + bins].conj() * amplitude[:, :k, None]
+        power = np.abs(correlation - left.sum(axis=1)) ** 2
+        power[each, chosen] = -1.0
+        support[:, k] = power.argmax(axis=1)
+        chosen = support[:, : k + 1]
+        products = gram[chosen[:, None] - chosen[:, :, None] + num_chirps]
+        products = products + RIDGE * gram_re[0] * np.eye(k + 1)
+        right = correlation[each, chosen][..., None].astype(complex)
+        amplitude[:, : k + 1] = np.linalg.solve(products, right)[..., 0]
 
 
 class Omp(LatinUnion):

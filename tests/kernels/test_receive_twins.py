@@ -15,8 +15,10 @@ from isac_rt.kernels.receive_directions import REACH, TABLE_STEPS
 from isac_rt.kernels.receive_estimate import Chirps, WindowAxis
 from isac_rt.kernels.receive_maps import ROWS
 from isac_rt.kernels.vector import LANES, PART, aligned
-from isac_rt.receive import cfar, directions, estimate, maps, pursuit, spectrum
+from isac_rt.receive import cfar, directions, estimate, maps, omp, pursuit, spectrum, transform
 from isac_rt.receive.clutter import covariance
+from isac_rt.receive.joint import moments
+from isac_rt.receive.joint.tones import JointPath, Tones, powers_of_time
 from isac_rt.receive.known import Known
 
 TWINNED = cfar, covariance, estimate, pursuit, spectrum
@@ -211,3 +213,81 @@ def test_a_template_added():
         (231.0, 256.0),
     )
     assert_twins_agree("isac_rt.receive.pursuit.add_template", *args, rtol=1e-6)
+
+
+def test_atoms_of_a_pursuit():
+    """Sparse random slots. Planted bugs in the kernel: the Gram matrix conjugated where atoms are
+    taken out; the last amplitude not in the back substitution."""
+    rng, slots = np.random.default_rng(12), 90
+    chosen = np.sort(rng.choice(slots, 31, replace=False))
+    analysis, gram = omp._dictionary(tuple(chosen.tolist()), slots)
+    first = complex_noise(rng, 40, 31) @ analysis
+    out = np.zeros((40, 4), np.int64), np.zeros((40, 4), complex)
+    # amplitudes by the normal equations of float32 correlations
+    assert_twins_agree("isac_rt.receive.omp.fill_atoms", first, *gram, *out, rtol=1e-5)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_cells_of_range_spectra(turned: bool):
+    """19 chirps, of which the last three fill no vector. Planted bugs in the kernel: the window's
+    taper of one neighbour alone; the turn conjugated."""
+    rng, size, chirps = np.random.default_rng(13), 80, 19
+    samples, factor = complex_noise(rng, 3, chirps, size), complex_noise(rng, chirps, size)
+    cells, turn = np.array([-3, 0, 7, 41]), complex_noise(rng, 4, chirps) if turned else None
+    results = []
+    for chosen in TWINS["isac_rt.receive.transform.fill_cells"]:
+        out = np.zeros((3, 4, chirps), np.complex64)
+        power, tapered = np.zeros((2, chirps, size), np.float32)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(transform, "fill_cells", chosen)
+            more = {"turn": turn, "power": power, "tapered": tapered}
+            transform.transform(samples, factor, cells, out, **more)
+        results.append((out, power, tapered))
+    for found, expected in zip(*results, strict=True):
+        most = np.abs(expected).max()
+        np.testing.assert_allclose(found, expected, rtol=0, atol=SINGLE * most)
+
+
+def two_tones(rng: np.random.Generator, passes: int) -> tuple[Known, Tones]:
+    w = Waveform(num_samples=64, num_chirps=24)
+    schedule = conventional_schedule(3, 24, 3)
+    payload = random_payload(w, schedule, 8, rng)
+    known = Known(w, schedule, payload.delay_symbols, payload.phases, ANTENNAS, passes)
+    paths = [
+        JointPath(1.1e-7 * (1 + 0.07 * i), 3e-8 * (i - 0.4), u, np.ones(1), np.zeros(4))
+        for i, u in enumerate(rng.uniform(-0.5, 0.5, (3, 2)))
+    ]
+    return known, Tones.of(known, paths)[0]
+
+
+@pytest.mark.parametrize("passes", [1, 2])
+def test_sums_of_tones_against_tones(passes: int):
+    """Planted bugs in the kernel: the turn between receivers left out; n^2 from sample 0."""
+    known, made = two_tones(np.random.default_rng(14), passes)
+    weights = powers_of_time(known, 3)
+    pairs = np.array([[1, 0], [2, 1], [0, 2]])
+    for powers in (1, 3):  # n^q in samples: one size of numbers at a time
+        out = np.zeros((3, powers, 3, 3, ANTENNAS.num_rx), complex)
+        kernel, twin = TWINS["isac_rt.receive.joint.tones.fill_cross_sums"]
+        by_kernel, by_twin = out.copy(), out.copy()
+        kernel(made, pairs, weights, by_kernel)
+        twin(made, pairs, weights, by_twin)
+        most = np.abs(by_twin).max(axis=(3, 4), keepdims=True)
+        assert (np.abs(by_kernel - by_twin) <= 1e-6 * most).all()  # of the nodes
+
+
+def test_sums_of_samples_against_tones():
+    """Planted bugs in the kernel: n from sample N // 2; the taps of the first receiver for all."""
+    rng = np.random.default_rng(15)
+    known, made = two_tones(rng, 1)
+    weights = powers_of_time(known, 2)
+    shape = known.schedule.shape
+    spectrum = complex_noise(rng, *shape, 96, 16).view(np.float32)
+    out = np.zeros((3, 2, 2, 3, ANTENNAS.num_rx), complex)
+    args = spectrum, made, weights, 0.5, moments._kernel(), out
+    kernel, twin = TWINS["isac_rt.receive.joint.moments.fill_sums"]
+    by_kernel, by_twin = out.copy(), out.copy()
+    kernel(*args[:-1], by_kernel)
+    twin(*args[:-1], by_twin)
+    most = np.abs(by_twin).max(axis=(3, 4), keepdims=True)
+    assert (np.abs(by_kernel - by_twin) <= 1e-5 * most).all()  # taps in float32

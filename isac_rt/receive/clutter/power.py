@@ -18,6 +18,7 @@ from functools import lru_cache
 
 import numpy as np
 import scipy.fft
+from scipy import sparse
 
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.receive_directions import REACH
@@ -73,14 +74,17 @@ def slow_power(waveform: Waveform, offset: np.ndarray, width: float) -> np.ndarr
 
 
 @lru_cache(maxsize=16)
-def _kernels(waveform: Waveform, taper: Taper) -> tuple[np.ndarray, np.ndarray]:
-    """Range response at the grid's offsets, and the transform of the Doppler response."""
+def _kernels(waveform: Waveform, taper: Taper, rows: int) -> tuple[sparse.csr_array, np.ndarray]:
+    """Range response as a matrix (rows, lines of the grid), and the transform of the Doppler
+    response."""
     across = np.arange(-REACH * FINE_BEAT, REACH * FINE_BEAT + 1) / FINE_BEAT
     along = np.arange(waveform.num_chirps * FINE_DOPPLER) / FINE_DOPPLER
-    return (
-        range_power(waveform, across, taper.range_cells),
-        scipy.fft.rfft(slow_power(waveform, along, taper.doppler_bins)),
-    )
+    weights = range_power(waveform, across, taper.range_cells) / FINE_DOPPLER
+    first = FINE_BEAT * np.arange(rows)[:, None]
+    lines = (first + np.arange(weights.size)).ravel()
+    ends, size = np.arange(rows + 1) * weights.size, (rows + 2 * REACH) * FINE_BEAT
+    weigh = sparse.csr_array((np.tile(weights, rows), lines, ends), shape=(rows, size))
+    return weigh, scipy.fft.rfft(slow_power(waveform, along, taper.doppler_bins))
 
 
 @dataclass(frozen=True)
@@ -103,35 +107,37 @@ class Response:
     ) -> np.ndarray:
         """(1 + A, rows, P) power, and its derivatives where the bins of all scatterers move by
         `slope` (K, A), Doppler centred."""
-        across, along = _kernels(self.waveform, self.taper)
-        size = self.waveform.num_chirps
-        turn, bins = 2j * np.pi * np.arange(along.size) / size, np.arange(size // 2 + 1)
+        weigh, along = _kernels(self.waveform, self.taper, self.rows)
+        size, half = self.waveform.num_chirps, self.waveform.num_chirps // 2 + 1
+        turn = 2j * np.pi * np.arange(along.size) / size
+        inside, places, shares = self._places(beat, doppler)
+        grid_shape = weigh.shape[1], size * FINE_DOPPLER
         out = np.empty((1 + slope.shape[1], self.rows, size))
         for number, made in enumerate(out):
-            weight = power if number == 0 else power * slope[:, number - 1]
-            grid = self._on_grid(beat, doppler, weight)
-            heard = np.zeros((self.rows, grid.shape[1]))
-            for k, share in enumerate(across / FINE_DOPPLER):
-                heard += share * grid[k:][: FINE_BEAT * self.rows : FINE_BEAT]
+            weight = (power if number == 0 else power * slope[:, number - 1])[inside]
+            weights = np.concatenate([weight * share for share in shares])
+            grid = np.bincount(places, weights, grid_shape[0] * grid_shape[1])
+            spectra = scipy.fft.rfft(weigh @ grid.reshape(grid_shape))
+            spectra *= along if number == 0 else -along * turn
             # every third place alone is wanted: the three parts of the spectrum fall together
-            spectra = scipy.fft.rfft(heard) * (along if number == 0 else -along * turn)
-            folded = spectra[:, bins] + spectra[:, size + bins] + spectra[:, size - bins].conj()
+            folded = spectra[:, :half] + spectra[:, size : size + half]
+            folded += spectra[:, size : size - half : -1].conj()
             made[:] = scipy.fft.irfft(folded, size)
         return np.fft.fftshift(out, axes=2)
 
-    def _on_grid(self, beat: np.ndarray, doppler: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Scatterers on the nearest line of the fine grid, shared by the two of its places about
-        their Doppler."""
-        places = self.waveform.num_chirps * FINE_DOPPLER
-        lines = (self.rows + 2 * REACH) * FINE_BEAT
+    def _places(
+        self, beat: np.ndarray, doppler: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Which scatterers lie on the fine grid, the two places each of them has there, on the
+        nearest line and on both sides of its Doppler, and the shares that these take."""
+        size, lines = self.waveform.num_chirps * FINE_DOPPLER, (self.rows + 2 * REACH) * FINE_BEAT
         line = np.rint((beat + REACH) * FINE_BEAT).astype(np.int64)
         inside = (line >= 0) & (line < lines)
         at = doppler[inside] * FINE_DOPPLER
         left = np.floor(at).astype(np.int64)
-        share, first, weight = at - left, line[inside] * places, weight[inside]
-        grid = np.bincount(first + left % places, weight * (1 - share), lines * places)
-        grid += np.bincount(first + (left + 1) % places, weight * share, lines * places)
-        return grid.reshape(lines, places)
+        first, share = line[inside] * size, at - left
+        places = np.concatenate([first + left % size, first + (left + 1) % size])
+        return inside, places, (1 - share, share)
 
 
 def expected_power(

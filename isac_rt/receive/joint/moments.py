@@ -25,7 +25,8 @@ import scipy.fft
 from numpy.polynomial import Chebyshev
 from scipy.special import i0
 
-from isac_rt.kernels.jit import jit
+from isac_rt.kernels import receive_joint
+from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.vector import LANES, new_memory
 from isac_rt.receive.joint.tones import Tones, Weights
 from isac_rt.receive.known import Known
@@ -98,7 +99,7 @@ class Moments:
         late = size // 2 - (size - 1) / 2
         factors = weights.factors * self.known.phases.conj()
         turned = weights._replace(factors=factors)
-        _interpolate(self.spectrum.view(np.float32), tones, turned, late, _kernel(), out)
+        fill_sums(self.spectrum.view(np.float32), tones, turned, late, _kernel(), out)
         return out
 
 
@@ -128,73 +129,36 @@ def _kernel() -> np.ndarray:
     return out
 
 
-@jit(fast=True)
-def _interpolate(spectrum, tones, weights, late, kernel, out):
-    """`Moments.of`; `late` is the place of sample N // 2 from the middle, the spectrum real and
-    imaginary parts side by side.
-
-    Receivers have frequencies of their own, a fraction of a grid point apart: their taps are
-    weighted on a common stretch of the grid.
-    """
-    factors, place, _ = weights
-    num_groups, num_chirps, size, width = spectrum.shape
-    (steps, _, taps), num_rx = kernel.shape, out.shape[4]
-    count = len(out)
-    ramp, turn = np.empty((count, num_rx)), np.empty((count, num_rx), np.complex128)
-    low, span = np.empty(count), np.empty(count, np.int64)
-    for k in range(count):
-        for rx in range(num_rx):
-            own = tones.delay[k, rx]
-            ramp[k, rx] = own * tones.slope * tones.interval
-            turns = own * tones.middle[k] - tones.slope * own * own / 2 + ramp[k, rx] * late
-            angle = 2 * np.pi * (turns - np.floor(turns))
-            turn[k, rx] = complex(np.cos(angle), -np.sin(angle))
-        low[k] = ramp[k].min()
-        span[k] = taps + 1 + int(np.ceil((ramp[k].max() - low[k]) * size))
-    zeroth, slant = np.empty(width, np.float32), np.empty(width, np.float32)
-    weight, change = np.empty((2, span.max(), width), np.float32)
-    tap = np.empty((2, taps), np.float32)
-    for m in range(num_groups):
-        for p in range(num_chirps):
-            for k in range(count):  # tones of like frequencies find each other's part of the grid
-                f = tones.frequency[k, m, p]
-                first = np.floor((f + low[k]) * size)
-                weight[:], change[:], zeroth[:], slant[:] = 0.0, 0.0, 0.0, 0.0
-                for rx in range(num_rx):
-                    at = (f + ramp[k, rx]) * size
-                    whole = np.floor(at)
-                    part = (at - whole) * steps
-                    step = min(int(part), steps - 1)
-                    x, table = np.float32((part - step - 0.5) / steps), kernel[step]
-                    half = x / np.float32(2)
-                    for i in range(taps):
-                        k1, k2 = table[1, i], table[2, i]
-                        tap[0, i] = table[0, i] + x * (k1 + half * k2)
-                        tap[1, i] = k1 + x * (k2 + half * table[3, i])
-                    begin = int(whole - first)
-                    for i in range(taps):
-                        weight[begin + i, 2 * rx] = weight[begin + i, 2 * rx + 1] = tap[0, i]
-                        change[begin + i, 2 * rx] = change[begin + i, 2 * rx + 1] = tap[1, i]
-                at = (int(first) - taps // 2 + 1) % size
-                for i in range(span[k]):
-                    line, own_weight, own_change = spectrum[m, p, at], weight[i], change[i]
-                    for c in range(width):
-                        zeroth[c] += own_weight[c] * line[c]
-                        slant[c] += own_change[c] * line[c]
-                    at += 1
-                    if at == size:
-                        at = 0
-                turns = tones.cycles[k, m, p] + f * late
-                angle = 2 * np.pi * (turns - np.floor(turns))
-                back = complex(np.cos(angle), -np.sin(angle))
-                wobble = 2 * np.pi * (tones.carrier[k, m, p] - tones.middle[k])
-                a = place[m, p]
-                for rx in range(num_rx):
-                    z = wobble * tones.delay[k, rx]
-                    one = back * turn[k, rx] * complex(1 - z * z / 2, -z * (1 - z * z / 6))
-                    total = complex(zeroth[2 * rx], zeroth[2 * rx + 1]) * one
-                    slope = size / (2 * np.pi) * complex(-slant[2 * rx + 1], slant[2 * rx]) * one
-                    slope += late * total
-                    for i in range(len(factors)):
-                        out[k, 0, i, a, rx] += factors[i, m, p] * total
-                        out[k, 1, i, a, rx] += factors[i, m, p] * slope
+@twin_of(receive_joint.interpolate)
+def fill_sums(
+    spectrum: np.ndarray,
+    tones: Tones,
+    weights: Weights,
+    late: float,
+    kernel: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Fill `Moments.of` from the spectrum, (M, P, G, 2 lanes) real and imaginary parts in turn;
+    `late` is the place of sample N // 2 from the middle, `kernel` see `_kernel`."""
+    data, t, (factors, place, _) = spectrum.view(np.complex64), tones, weights
+    (steps, _, taps), size = kernel.shape, data.shape[2]
+    group, chirp = np.indices(place.shape)[..., None]
+    for k, rx in np.ndindex(len(out), out.shape[4]):
+        own, f = t.delay[k, rx], t.frequency[k]
+        ramp = own * t.slope * t.interval
+        at = (f + ramp) * size
+        whole, part = np.floor(at).astype(int), at % 1 * steps
+        step = np.minimum(part.astype(int), steps - 1)
+        x, table = ((part - step - 0.5) / steps)[..., None], kernel[step]
+        values = table[..., 0, :] + x * (table[..., 1, :] + x / 2 * table[..., 2, :])
+        slopes = table[..., 1, :] + x * (table[..., 2, :] + x / 2 * table[..., 3, :])
+        near = data[group, chirp, (whole[..., None] - taps // 2 + 1 + np.arange(taps)) % size, rx]
+        turns = own * t.middle[k] - t.slope * own**2 / 2 + ramp * late + t.cycles[k] + f * late
+        turns = turns + (t.carrier[k] - t.middle[k]) * own
+        back = np.exp(-2j * np.pi * (turns % 1))
+        zeroth = (values * near).sum(axis=-1) * back
+        first = 1j * size / (2 * np.pi) * (slopes * near).sum(axis=-1) * back + late * zeroth
+        for a in range(out.shape[3]):
+            here = place == a
+            out[k, 0, :, a, rx] += factors[:, here] @ zeroth[here]
+            out[k, 1, :, a, rx] += factors[:, here] @ first[here]

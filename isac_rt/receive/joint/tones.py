@@ -1,10 +1,7 @@
 """Paths as unit tones of a frame's chirps, and the sums of such tones against each other.
 
 What a fit needs of two tones are sums of T' T* n^q g(t) over the samples n of a chirp and over the
-chirps t of a transmit antenna, receiver by receiver. Over the samples they are closed form, and a
-smooth function of the frequency between the tones. That frequency hardly changes over a frame, by
-what the paths migrate: a few Chebyshev nodes hold it. So the chirps are gone through once for all
-receivers, and the closed form is computed at the nodes instead of at every chirp and receiver.
+chirps t of a transmit antenna, receiver by receiver.
 """
 
 from __future__ import annotations
@@ -16,16 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from isac_rt.frame.waveform import Waveform
-from isac_rt.kernels.jit import jit
+from isac_rt.kernels import receive_joint
+from isac_rt.kernels.jit import twin_of
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.known import Known
 
 PARAMETERS = 4  # delay, delay rate, u_x, u_z
 BY_PATH = "cycles", "frequency", "carrier", "middle", "delay"
-TURNED = 1e-7
-"""Share of a sum that the turn between receivers may leave where its next order is left out."""
-EXACT = 1e-8
-"""Of the largest sum, what the nodes leave."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +148,7 @@ def cross_sums(tones: Tones, pairs: np.ndarray, weights: Weights, powers: int = 
     shape = len(pairs), powers, len(weights.factors), weights.places, tones.delay.shape[1]
     out = np.empty(shape, complex)
     if len(pairs):
-        _cross(tones, np.asarray(pairs, np.int64), weights, out)
+        fill_cross_sums(tones, np.asarray(pairs, np.int64), weights, out)
     return out
 
 
@@ -167,111 +161,23 @@ def own_sums(size: float, weights: Weights, powers: int = 3) -> np.ndarray:
     return over[:, None, None, None] * total.T[..., None]
 
 
-@jit(borrows=True)
-def _nodes(reach):
-    """Chebyshev nodes for sums over frequencies within `reach` cells of the middle one: they are
-    band-limited to half a cycle a cell."""
-    count, left = 1, np.pi * reach
-    while left > EXACT and count < 64:
-        count += 1
-        left *= np.pi * reach / 2 / count
-    return count
-
-
-@jit(fast=True)
-def _cross(tones, pairs, weights, out):
-    factors, place, places = weights
-    num_weights, num_groups, num_chirps = factors.shape
-    for s in range(len(pairs)):
-        k, j = pairs[s]
-        low, high, wide = np.inf, -np.inf, 0.0
-        for m in range(num_groups):
-            for p in range(num_chirps):
-                x = tones.frequency[j, m, p] - tones.frequency[k, m, p]
-                low, high = min(low, x), max(high, x)
-                wide = max(wide, abs(tones.carrier[k, m, p] - tones.middle[k]))
-        middle, half = (low + high) / 2, max((high - low) / 2, 1e-30)
-        count = _nodes(half * tones.size)
-        wobble = 2 * np.pi * wide * np.abs(tones.delay[j] - tones.delay[k]).max()
-        orders = 1 if wobble < TURNED else (2 if wobble * wobble / 2 < TURNED else 3)
-        sums = np.zeros((orders, num_weights, places, count), np.complex128)
-        level = np.empty(count)
-        for m in range(num_groups):
-            for p in range(num_chirps):
-                turns = tones.cycles[j, m, p] - tones.cycles[k, m, p]
-                angle = 2 * np.pi * (turns - np.floor(turns))
-                turn = complex(np.cos(angle), np.sin(angle))
-                x = (tones.frequency[j, m, p] - tones.frequency[k, m, p] - middle) / half
-                level[0] = 1.0
-                if count > 1:
-                    level[1] = x
-                for c in range(2, count):
-                    level[c] = 2 * x * level[c - 1] - level[c - 2]
-                a, z = place[m, p], tones.carrier[k, m, p] - tones.middle[k]
-                for i in range(num_weights):
-                    one = turn * factors[i, m, p]
-                    for b in range(orders):
-                        for c in range(count):
-                            sums[b, i, a, c] += one * level[c]
-                        one *= z
-        _over_nodes(tones, (k, j), (middle, half), sums, out[s])
-
-
-@jit(fast=True)
-def _over_nodes(tones, pair, span, sums, out):
-    """The sums over chirps for each Chebyshev polynomial of the frequency, brought together with
-    the closed form at the nodes of each receiver."""
-    k, j = pair
-    middle, half = span
-    powers, num_weights, places, num_rx = out.shape
-    orders, count = sums.shape[0], sums.shape[3]
-    value, shape = np.empty((3, count)), np.empty((3, count))
-    for rx in range(num_rx):
-        mine, other = tones.delay[k, rx], tones.delay[j, rx]
-        ramp = (other - mine) * tones.slope * tones.interval
-        for i in range(count):
-            node = middle + half * np.cos(np.pi * (i + 0.5) / count)
-            value[0, i], value[1, i], value[2, i] = closed_sums(node + ramp, tones.size)
-        for c in range(count):
-            share = (1.0 if c == 0 else 2.0) / count
-            for q in range(powers):
-                shape[q, c] = 0.0
-            for i in range(count):
-                at = share * np.cos(np.pi * c * (i + 0.5) / count)
-                for q in range(powers):
-                    shape[q, c] += at * value[q, i]
-        turns = other * tones.middle[j] - mine * tones.middle[k]
-        turns -= tones.slope * (other * other - mine * mine) / 2
-        angle = 2 * np.pi * (turns - np.floor(turns))
-        turn = complex(np.cos(angle), np.sin(angle))
-        apart = 2 * np.pi * (other - mine)
-        for i in range(num_weights):
-            for a in range(places):
-                for q in range(powers):
-                    total = 0j
-                    for c in range(count):
-                        one = sums[0, i, a, c]
-                        if orders > 1:
-                            one += complex(0, apart) * sums[1, i, a, c]
-                        if orders > 2:
-                            one -= apart * apart / 2 * sums[2, i, a, c]
-                        total += shape[q, c] * one
-                    out[q, i, a, rx] = total * turn * (1j if q == 1 else 1.0)
-
-
-@jit(inline=True)
-def closed_sums(x, size):
-    """Sums of exp(j 2 pi x n) times 1, -j n and n^2 over a chirp, n from its middle."""
-    second = size * (size * size - 1) / 12
-    if abs(x) < 1e-2 / size:  # the closed forms lose digits there
-        y = 2 * np.pi * x
-        fourth = second * (3 * size * size - 7) / 20
-        return (
-            size - second * y * y / 2,
-            second * y - fourth * y * y * y / 6,
-            second - fourth * y * y / 2,
-        )
-    s, k = np.sin(np.pi * size * x), np.cos(np.pi * size * x)
-    t, u = np.sin(np.pi * x), np.cos(np.pi * x)
-    edge = (size * k * t - s * u) / (t * t) / 2
-    return s / t, -edge, u / t * edge - (1 - size * size) * s / t / 4
+@twin_of(receive_joint.cross)
+def fill_cross_sums(tones: Tones, pairs: np.ndarray, weights: Weights, out: np.ndarray) -> None:
+    """Fill (Q, powers, I, A, L_rx) sums of n^q g_i T_j T_k* over the samples n of each chirp, from
+    its middle, and over the chirps of each place, for `pairs` (Q, 2) of k and j."""
+    t, size = tones, int(tones.size)
+    n = np.arange(size) - (size - 1) / 2
+    powers = n ** np.arange(out.shape[1])[:, None]
+    for s, (k, j) in enumerate(pairs):
+        turns, frequency = t.cycles[j] - t.cycles[k], t.frequency[j] - t.frequency[k]
+        wobble = t.carrier[k] - t.middle[k]
+        for rx in range(out.shape[4]):
+            mine, other = t.delay[k, rx], t.delay[j, rx]
+            own = other * t.middle[j] - mine * t.middle[k] - t.slope * (other**2 - mine**2) / 2
+            phase = turns + own + (other - mine) * wobble
+            beat = frequency + (other - mine) * t.slope * t.interval
+            chirps = np.exp(2j * np.pi * beat[..., None] * n) @ powers.T  # (M, P, powers)
+            chirps = chirps * np.exp(2j * np.pi * (phase % 1))[..., None]
+            for a in range(weights.places):
+                here = weights.place == a
+                out[s, :, :, a, rx] = chirps[here].T @ weights.factors[:, here].T
