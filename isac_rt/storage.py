@@ -50,6 +50,8 @@ HDF5_PACKING = 1100
 MAX_HDF5_PIECE = 2**24
 """A piece (chunk) that is larger than its dataset has at most so many bytes."""
 MAX_HDF5_DEPTH = 8
+MOST_JSON_BYTES = 16 * 1024**2
+"""No file of JSON is larger: nothing but empty lists takes 53 times its size."""
 KEPT = "ISAC_RT_KEPT"
 """Variable of the environment: folder of what is `kept`; empty: nothing is."""
 KEPT_BYTES = 1024**3

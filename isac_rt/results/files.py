@@ -21,7 +21,14 @@ from pydantic import BaseModel
 from isac_rt.results.recorder import Results
 from isac_rt.runtime import UserError, available_memory, shortly
 from isac_rt.scenario.file import to_yaml
-from isac_rt.storage import BAD_DATA, StorageError, check_unfolded, read_whole, write_whole
+from isac_rt.storage import (
+    BAD_DATA,
+    MOST_JSON_BYTES,
+    StorageError,
+    check_unfolded,
+    read_whole,
+    write_whole,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -143,7 +150,7 @@ def open_results(folder: str | Path) -> Results:
     folder = Path(folder)
     try:
         dataset = read_dataset(folder / FILE)
-        summary = json.loads(read_whole(folder / "summary.json"))
+        summary = json.loads(read_whole(folder / "summary.json", MOST_JSON_BYTES))
         _Summary.model_validate(summary)
     except (OSError, MemoryError, *BAD_DATA) as problem:
         raise ResultsError(

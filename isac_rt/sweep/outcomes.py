@@ -26,6 +26,7 @@ from isac_rt.scenario.tree import Scenario
 from isac_rt.settings import plain_tree
 from isac_rt.storage import (
     BAD_DATA,
+    MOST_JSON_BYTES,
     checksum,
     program_fingerprint,
     read_whole,
@@ -127,7 +128,7 @@ class Outcomes:
         ResultsError  If it is the folder of no sweep.
         """
         try:
-            tree = json.loads(read_whole(self.folder / DEFINITION))
+            tree = json.loads(read_whole(self.folder / DEFINITION, MOST_JSON_BYTES))
             return Plan(
                 Sweep.model_validate(tree["sweep"]),
                 Scenario.model_validate(tree["base"]).in_folder(Path(tree["folder"])),

@@ -24,7 +24,7 @@ from isac_rt.results.files import ResultsError
 from isac_rt.results.recorder import Results
 from isac_rt.runtime import shortly
 from isac_rt.simulation.setup import Setup
-from isac_rt.storage import BAD_DATA, read_whole
+from isac_rt.storage import BAD_DATA, MOST_JSON_BYTES, read_whole
 
 COLUMNS = {
     "paths": (
@@ -186,7 +186,7 @@ def read_card(folder: Path) -> dict[str, Any]:
     ResultsError  If it is the folder of none.
     """
     try:
-        card = json.loads(read_whole(folder / CARD))
+        card = json.loads(read_whole(folder / CARD, MOST_JSON_BYTES))
         for name, count in (item for shards in card["splits"].values() for item in shards.items()):
             if type(count) is not int or count < 0 or ".." in name or Path(name).is_absolute():
                 raise ValueError(f"the shard {name[:80]} cannot be")

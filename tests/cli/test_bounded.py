@@ -12,6 +12,9 @@ import numpy as np
 import pytest
 from bounded import bounded_command
 
+from isac_rt.results.files import ResultsError
+from isac_rt.sweep.shards import read_card
+
 MANY = 900_000
 TEXTS = {
     "flow list": "a: [" + "1," * MANY + "]",
@@ -99,6 +102,13 @@ def test_hdf5_that_unfolds_without_end(make: Callable, name: str, tmp_path: Path
     if name.endswith(".mat"):
         arguments = ["import", name, "--out", "b.nc"]
     assert name in bounded_command(arguments, tmp_path)
+
+
+def test_a_data_set_whose_card_is_without_end(tmp_path):
+    """Nothing but empty lists: 53 times their size in memory."""
+    (tmp_path / "card.json").write_text("[" + "[]," * 9_000_000 + "[]]")
+    with pytest.raises(ResultsError, match="larger than"):
+        read_card(tmp_path)
 
 
 def test_a_run_whose_results_unfold_without_end(tmp_path):
