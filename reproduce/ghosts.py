@@ -26,9 +26,10 @@ from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import Setup, prepare
-from isac_rt.track.ghosts import Leeway, Suspicion, Walls, suspicion
+from isac_rt.track.ghosts import Leeway, Suspicion, suspicion
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
 from isac_rt.track.tracker import TrackSet
+from isac_rt.track.walls import Walls
 from isac_rt.world.swarm import Pose
 from reproduce import SCENES
 from reproduce.outcome import Outcome, Progress, Sentences, Verdict, proportion

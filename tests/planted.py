@@ -698,9 +698,9 @@ OF_TESTS = (
     (
         "test_resume::test_everything_that_is_carried_over_is_taken_up",
         Bug(
-            "track/terminal.py",
-            '"slips_repaired": self.slips_repaired,',
-            '"slips_repaired": 0,',
+            "plain.py",
+            "{f.name: plain(getattr(value, f.name)) for f in fields(value) if f.init}",
+            '{f.name: 0 if f.name == "slips_repaired" else plain(getattr(value, f.name)) for f in fields(value) if f.init}',
         ),
     ),
     (

@@ -32,7 +32,7 @@ from isac_rt.results.metrics import (
     within_view,
 )
 from isac_rt.results.records import LateRecord, ObserverRecord, TrackTable, UavValues
-from isac_rt.track.retrospect import Late
+from isac_rt.track.parts import Late
 from isac_rt.track.tracker import TrackSet
 from isac_rt.world.swarm import Swarm
 

@@ -18,18 +18,10 @@ from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
 from isac_rt.track.filter import Ambiguity
-from isac_rt.track.fusion import (
-    Fused,
-    KnownBody,
-    Picture,
-    advance,
-    at_once,
-    in_world,
-    its_word,
-    of_itself,
-)
+from isac_rt.track.fusion import Fused, Picture, advance, at_once, in_world, its_word
+from isac_rt.track.parts import KnownBody, of_itself
 from isac_rt.track.pool import Lives, Look, PooledTracker
-from isac_rt.track.terminal import TerminalState
+from isac_rt.track.reference import TerminalState
 from isac_rt.track.tracker import in_plane
 from isac_rt.world.swarm import Pose
 

@@ -56,8 +56,8 @@ from isac_rt.simulation.preflight import (
 )
 from isac_rt.simulation.stopwatch import NONE, Seconds
 from isac_rt.track.expectation import ClutterExpectation, Mistakes, make_expectation
-from isac_rt.track.ghosts import Walls
 from isac_rt.track.settings import Belief
+from isac_rt.track.walls import Walls
 from isac_rt.world.area import city_about, city_digest
 from isac_rt.world.city import CityMesh
 from isac_rt.world.swarm import Pose, Swarm

@@ -38,15 +38,10 @@ from isac_rt.simulation.preflight import receivers_at_work
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
 from isac_rt.simulation.stopwatch import Stopwatch
-from isac_rt.track.fusion import KnownBody
-from isac_rt.track.retrospect import Late
-from isac_rt.track.terminal import (
-    ActiveTerminal,
-    PassiveTerminal,
-    Receiver,
-    Surroundings,
-    TerminalState,
-)
+from isac_rt.track.parts import KnownBody, Late
+from isac_rt.track.reference import TerminalState
+from isac_rt.track.standard import Surroundings, active_terminal, passive_terminal
+from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal, Receiver
 from isac_rt.world.swarm import Pose
 
 _LOG = logging.getLogger(__name__)
@@ -75,12 +70,12 @@ def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = N
     s = settings or setup.scenario
     walls = setup.walls if s.tracking.needs_mesh else None
     if link.own:
-        return ActiveTerminal(setup.waveform, setup.antennas, s.receivers, s.tracking, walls)
+        return active_terminal(setup.waveform, setup.antennas, s.receivers, s.tracking, walls)
     clutter = None
     if s.receivers.passive_detector == "beams" and setup.expectation is not None:
         known = link, setup.plan.amplitude
         clutter = partial(setup.expectation.between, *known, mistakes=setup.mistakes)
-    return PassiveTerminal(
+    return passive_terminal(
         setup.waveform,
         setup.antennas,
         s.receivers,
@@ -156,7 +151,7 @@ class _Observer:
                 told=told,
                 maps=maps,
             )
-            state, late = int(self.terminal.state), self.terminal.late
+            state, late = int(self.terminal.status), self.terminal.late
         self.seconds += time.thread_time() - begun
         return Heard(reception, tracks, state, late)
 

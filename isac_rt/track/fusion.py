@@ -22,14 +22,12 @@ from scipy.special import gammaincinv
 from isac_rt.kernels.jit import jit
 from isac_rt.plain import Stateful
 from isac_rt.track.filter import Gaussian, distance, singer
+from isac_rt.track.parts import POSE_STD
 from isac_rt.track.tracker import LEAST_APART, TrackSet, assign
 from isac_rt.world.swarm import Pose
 
 SIZE = 6
 """Position and velocity in world axes [m, m/s]: what terminals tell each other of a body."""
-POSE_STD = (0.05, 0.05)
-"""Deviations of a terminal's own position and velocity on each axis, as satellites and inertial
-sensors give them [m, m/s]. They are part of what it says of itself and of others."""
 DATUM_STD = (0.05, 0.05)
 """And of what all terminals are wrong alike, for they hear the same satellites [m, m/s]: nothing
 that they tell each other shows it, and all bodies of a picture have it."""
@@ -178,14 +176,6 @@ class Fused:
     terminal: str | None = None
 
 
-class KnownBody(NamedTuple):
-    """A body that a terminal knows of from others: its position and velocity (6,), and the terminal
-    of the swarm that it is by its own word, "" if it is none."""
-
-    terminal: str
-    state: Gaussian
-
-
 def advance(state: Gaussian, interval: float, acceleration_std: float) -> Gaussian:
     """Position and velocity (6,) after an interval [s] of Singer's model. The acceleration is not
     told: it is zero with `acceleration_std` [m/s^2] per axis."""
@@ -275,12 +265,6 @@ def _by_clock(offset: np.ndarray, baseline: np.ndarray) -> np.ndarray:
         return u * (rho / d) ** 2
     # of rho = (L^2 - d^2) / (2 (L - d.u)), L and d both by one metre
     return u * (length - d - rho * (1 - ahead / d)) / (length - ahead)
-
-
-def of_itself(own: Pose) -> Gaussian:
-    """What a terminal says of its own position and velocity."""
-    variance = np.repeat(np.square(POSE_STD), 3)
-    return Gaussian(np.concatenate([own.position, own.velocity]), np.diag(variance))
 
 
 def its_word(said: Gaussian) -> Told:

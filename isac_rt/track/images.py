@@ -9,9 +9,7 @@ buildings is not asked for: an image that is not there only forbids births in a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,9 +18,9 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.jit import jit
 from isac_rt.receive.types import Detections
-from isac_rt.track.filter import Gaussian, wrapped
-from isac_rt.track.ghosts import Leeway, Walls, suspicion
-from isac_rt.track.tracker import Track, Tracker, track_set
+from isac_rt.track.filter import Ambiguity, wrapped
+from isac_rt.track.parts import Own, TrackRule
+from isac_rt.track.walls import Walls
 from isac_rt.world.swarm import Pose
 
 EDGE = 0.3
@@ -33,89 +31,41 @@ BESIDE_CELLS = 1.5
 """Off an image by no more cells of range and of rate than these, a detection is taken for it."""
 WELL_INSIDE = 0.95
 """Share of the view's largest cosines within which a direction is no alias of one outside."""
-ECHOED_FRAMES = 3
-"""So many frames in a row a confirmed track fits a nearer body's echo, or lies behind a wall,
-before it ends: the body may be known only after its echo was confirmed, the place only then well
-enough, and a UAV may cross the place of another one's echo."""
-CROSSING_M = 3.0
-"""Confirmed tracks are held against the walls so near to them [m]: one that lay before all walls
-comes by here on its way behind one."""
 ALIAS_DEVIATIONS = 3.0
 """So many deviations further inside at a passive terminal, whose array is a third as long."""
 
 
-@dataclass(frozen=True)
-class Doubts:
-    """What a terminal does not take for a UAV.
+class Images(TrackRule):
+    """No track starts from what may be an image of the terminal, at a passive one of its
+    transmitter, or an alias from beyond the view.
 
-    Attributes
+    Parameters
     ----------
     walls : the mesh
-    antennas : Antennas
-    waveform : Waveform
     passes : 2 at an active terminal, 1 at a passive one
     """
 
-    walls: Walls
-    antennas: Antennas
-    waveform: Waveform
-    passes: int = 2
+    def __init__(self, walls: Walls, antennas: Antennas, waveform: Waveform, passes: int) -> None:
+        self._walls, self._passes = walls, passes
+        self._edge = WELL_INSIDE * antennas.view_limit
+        self._ambiguity = Ambiguity.of(waveform, passes)
+        self._cells = np.array([waveform.range_cell(passes), waveform.velocity_cell(passes)])
 
-    def births(
-        self, detections: Detections, own: Pose, sender: np.ndarray | None = None
-    ) -> Detections:
-        """The same detections; none starts a track that may be an image of the terminal, at a
-        passive one of its `sender` (6,) in world coordinates, or an alias from beyond the view."""
-        d, w = detections, self.waveform
-        spread = ALIAS_DEVIATIONS * d.std[:, 2:] if self.passes == 1 else 0.0
-        inside = np.abs(d.direction) + spread < WELL_INSIDE * self.antennas.view_limit
+    def births(self, detections: Detections, own: Own) -> Detections:
+        d, sender = detections, own.transmitter
+        spread = ALIAS_DEVIATIONS * d.std[:, 2:] if self._passes == 1 else 0.0
+        inside = np.abs(d.direction) + spread < self._edge
         starts = d.starts & inside.all(axis=1)
         if starts.any():
             reach = float(d.range[starts].max()) + 1
             if sender is None:
-                shown = own_images(own, self.walls, reach)
+                shown = own_images(own.pose, self._walls, reach)
             else:
-                shown = sender_images(sender, own, self.walls, reach)
-            off = np.column_stack([d.range, d.velocity])[:, None] - shown
-            off = wrapped(off, self._leeway.ambiguity)
-            cells = np.array([w.range_cell(self.passes), w.velocity_cell(self.passes)])
-            allowed = BESIDE_CELLS * cells
-            starts &= ~(np.abs(off) < allowed).all(axis=-1).any(axis=1)
+                shown = sender_images(sender.mean[:6], own.pose, self._walls, reach)
+            off = wrapped(d.measured[:, None, :2] - shown, self._ambiguity)
+            beside = (np.abs(off) < BESIDE_CELLS * self._cells).all(axis=-1)
+            starts &= ~beside.any(axis=1)
         return replace(d, starts=starts)
-
-    def remove_ghosts(
-        self,
-        tracker: Tracker,
-        new: set[int],
-        own: Pose,
-        reference: Track | None = None,
-        told: Sequence[Gaussian] = (),
-    ) -> None:
-        """Take out the tracks, among those `new` to be confirmed, that a wall explains, and of
-        the others those that are a nearer body's echoes over a wall frame after frame, or that went
-        behind one; at a passive terminal with its `reference`. Of bodies that were `told` echoes
-        are known as well as of tracks."""
-        confirmed = {t.id for t in tracker.tracks if t.confirmed}
-        if not confirmed:
-            return
-        tracks = tracker.snapshot(own, reference)
-        crossing = {
-            t.id
-            for t in tracker.tracks
-            if t.id in confirmed - new and self.walls.within(t.state.mean[:3], CROSSING_M)
-        }
-        asked = np.isin(tracks.ids, [*(confirmed & new | crossing)]) & ~tracks.is_reference
-        others = track_set([Track.of_body(body) for body in told], own, reference)
-        said = suspicion(tracks, own, self.walls, self._leeway, others, asked)
-        suspect = set(tracks.ids[said.suspect].tolist())
-        for track in tracker.tracks:
-            track.echoed = track.echoed + 1 if track.id in suspect else 0
-        echoes = {t.id for t in tracker.tracks if t.echoed >= ECHOED_FRAMES}
-        tracker.drop(echoes | (suspect & confirmed & new))
-
-    @cached_property
-    def _leeway(self) -> Leeway:
-        return Leeway.of(self.waveform, self.antennas, self.passes)
 
 
 def own_images(own: Pose, walls: Walls, reach: float) -> np.ndarray:

@@ -35,7 +35,6 @@ from isac_rt.track.fusion import (
     ATTITUDE_STD,
     ERRORS,
     JOIN_PROBABILITY,
-    POSE_STD,
     SIZE,
     Fused,
     Key,
@@ -45,6 +44,7 @@ from isac_rt.track.fusion import (
     in_datum,
     recognise,
 )
+from isac_rt.track.parts import POSE_STD
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import ROUNDING, assign
 from isac_rt.world.swarm import Pose

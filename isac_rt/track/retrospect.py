@@ -9,45 +9,34 @@ data are out.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from isac_rt.frame.cube import IFCube
-from isac_rt.frame.waveform import Waveform
-from isac_rt.plain import Stateful
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.symbols.blind import DataPath, Peaks, acquire
 from isac_rt.receive.types import Detections, Hints, Reception
+from isac_rt.track.filter import measure
+from isac_rt.track.images import WELL_INSIDE, sender_images
+from isac_rt.track.parts import Late, OtherPaths, Own, delayed
+from isac_rt.track.reference import COAST_CELLS, Reference
+from isac_rt.track.walls import Walls
 
 BATCH = 8
 """Frames kept at most."""
 SPAN = 0.5
 """Age at which a frame is let go [s]: longer flights bend more than the comb tries."""
-COAST_CELLS = 0.2
-"""A prediction whose range is known worse than this many cells cannot read the fraction of a
-cell."""
 GATE_CELLS, GATE_STDS = 0.4, 3.0
 """Cells, or deviations of what is predicted, within which the path is found again in a frame that
 was read over it."""
 STD_CELLS = 0.02
 """Floor of its range and velocity deviations in cells."""
+NAMED_CELLS = 1.5
+"""Cells of length and of its rate within which a path is one that the city explains."""
 FIRST_BEND = 3.0
 """Deviation of the acceleration of a path that is seen for the first time [m/s^2]."""
-
-
-@dataclass(frozen=True)
-class Late:
-    """A frame that was read after others had come.
-
-    Attributes
-    ----------
-    time : of its middle [s]
-    reception : its symbols
-    """
-
-    time: float
-    reception: Reception
 
 
 @dataclass
@@ -59,20 +48,80 @@ class Waiting:
     path: DataPath | None = None
 
 
-class Retrospect(Stateful):
+class Retrospect(OtherPaths):
     """What a passive terminal keeps of frames that it could not read, and the path over which it
     reads now.
+
+    Parameters
+    ----------
+    receiver : of the terminal
+    walls : the mesh, by which a path over walls is recognised; None: no path is
 
     Attributes
     ----------
     late : earlier frames that the last one made readable
     """
 
-    def __init__(self, receiver: PassiveReceiver, waveform: Waveform) -> None:
-        self._receiver, self._waveform = receiver, waveform
+    def __init__(
+        self, receiver: PassiveReceiver, waveform: Waveform, walls: Walls | None = None
+    ) -> None:
+        self._receiver, self._waveform, self._walls = receiver, waveform, walls
         self._cells = np.array([waveform.range_cell(1), waveform.velocity_cell(1)])
         self.state = Waiting()
         self.late: tuple[Late, ...] = ()
+
+    @property
+    def is_reading(self) -> bool:
+        return self.state.path is not None
+
+    def read_frame(
+        self,
+        cube: IFCube,
+        reception: Reception,
+        own: Own,
+        reference: Reference,
+        *,
+        refused: bool,
+        anchored: bool,
+        maps: bool,
+    ) -> tuple[Reception, bool]:
+        self.late = ()
+        if anchored:
+            self.look(cube, own.time)
+            if refused:
+                self.start(delayed(reception.detections, own.clock), own.time)
+        if reception.line_of_sight:
+            self.forget()
+        if anchored or reception.decoded:
+            return reception, anchored
+        out = self.read(cube, own.time, Hints(own.clutter), maps=maps)
+        if out is None:
+            return reception, False
+        out = replace(out, detections=delayed(out.detections, own.clock, -1))
+        if out.line_of_sight and reference.is_plausible(out) and self._is_well_inside(out):
+            self.forget()
+            return out, True
+        return out.without_sight(self._is_named(own)), False
+
+    def _is_named(self, own: Own) -> bool:
+        """Return whether the path that is read over is as long, and changes as fast, as a path from
+        the transmitter over the city's walls or about an edge."""
+        path = self.state.path
+        if self._walls is None or path is None or not own.over_other_path or own.sender is None:
+            return False
+        there = own.sender.state.mean
+        length = path.mean[:2] - SPEED_OF_LIGHT * own.clock
+        straight = measure(there, own.pose)[None, :2]
+        over_walls = sender_images(there[:6], own.pose, self._walls, float(length[0]) + 1)
+        apart = np.abs(np.concatenate([straight, over_walls]) - length)
+        return bool((apart < NAMED_CELLS * self._cells).all(axis=1).any())
+
+    def _is_well_inside(self, reception: Reception) -> bool:
+        """Return whether the reference is not so near the edge of the view that it may have come
+        from the opposite one: a track of it would fly elsewhere."""
+        d = reception.detections
+        edge = WELL_INSIDE * self._receiver.antennas.view_limit
+        return bool((np.abs(d.direction[d.is_reference]) < edge).all())
 
     def read(
         self,

@@ -28,11 +28,10 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.plain import Stateful
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.modes import MODES, polynomials
-from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Look, Neighbours
+from isac_rt.track.parts import HardwareModel
 
 GAIN_STD = 0.2, 0.6
 """Before the first look: logarithm of an element's amplitude (1.7 dB) and phase [rad] (34
@@ -143,7 +142,7 @@ class Hardware:
     time: float = np.nan
 
 
-class SelfCalibration(Stateful):
+class SelfCalibration(HardwareModel):
     """What a terminal knows of its hardware, and the correction of its samples by it.
 
     Parameters
@@ -170,6 +169,11 @@ class SelfCalibration(Stateful):
 
     def _known(self) -> tuple[np.ndarray, ...]:
         return self.state.gains.value, self.state.slopes.value, self.state.common, self.state.clock
+
+    @property
+    def clock(self) -> np.ndarray:
+        """Delay [s] and its rate by which all paths come late."""
+        return self.state.clock
 
     # ---- samples
 
@@ -351,14 +355,6 @@ class SelfCalibration(Stateful):
     @property
     def _rate_cell(self) -> float:
         return self.waveform.velocity_cell(1) / SPEED_OF_LIGHT
-
-
-def calibration_of(
-    receivers: Receivers, waveform: Waveform, antennas: Antennas, passes: int
-) -> SelfCalibration | None:
-    """What the settings ask for, before the first frame."""
-    wanted = receivers.self_calibration != "none"
-    return SelfCalibration(waveform, antennas, passes) if wanted else None
 
 
 class _Fitted(NamedTuple):

@@ -1,4 +1,5 @@
-"""Which strong paths of a frame come from where a terminal knows that somebody is."""
+"""A terminal that learns of its hardware from strong paths that come from where it knows that
+somebody is."""
 
 from __future__ import annotations
 
@@ -8,10 +9,11 @@ import numpy as np
 
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive.types import Look
+from isac_rt.receive.types import Look, Reception
 from isac_rt.track.filter import Ambiguity, Gaussian, measure, wrapped
-from isac_rt.track.self_calibration import FREE, Change, Sight
-from isac_rt.track.tracker import TrackSet
+from isac_rt.track.parts import Own
+from isac_rt.track.self_calibration import FREE, Change, SelfCalibration, Sight
+from isac_rt.track.tracker import Track, Tracker, TrackSet
 from isac_rt.world.swarm import Pose
 
 POSITION_STD, VELOCITY_STD = 0.02, 0.05
@@ -19,6 +21,26 @@ POSITION_STD, VELOCITY_STD = 0.02, 0.05
 [m, m/s]."""
 NEAR_CELLS = 1.5
 """Cells of range and of velocity within which a path is the one that is expected."""
+
+
+class LearnedHardware(SelfCalibration):
+    """The terminal's estimate of its hardware, fed by the frames that it receives."""
+
+    def learn_from(
+        self, reception: Reception, own: Own, tracker: Tracker, reference: Track | None
+    ) -> None:
+        if self._passes == 2:
+            tracks = tracker.snapshot(own.pose)
+            seen = echoes(reception.looks, self.waveform, own.pose, own.mates, tracks)
+        elif reference is None or reference.missed:
+            return
+        else:
+            seen = lines_of_sight(reception.looks, own.pose, own.mates, reference.state)
+        change = self.learn_all(seen, reception.neighbours if self._passes == 2 else None)
+        if reference is not None:
+            reference.state = seen_after(reference.state, own.pose, change, 1)
+        for track in tracker.tracks:
+            track.state = seen_after(track.state, own.pose, change, 2)
 
 
 def echoes(

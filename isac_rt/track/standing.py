@@ -10,16 +10,17 @@ what stands far out of its neighbours is a body, and no neighbour of what is far
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.waveform import Waveform
-from isac_rt.plain import Stateful
 from isac_rt.receive.types import Detections
-from isac_rt.track.ghosts import Walls
+from isac_rt.track.filter import Ambiguity
+from isac_rt.track.parts import Own, TrackRule
 from isac_rt.track.tracker import Track, Tracker
+from isac_rt.track.walls import Walls
 from isac_rt.world.swarm import Pose
 
 STILL_MPS = 0.5
@@ -51,17 +52,19 @@ class Seen:
     echoes: np.ndarray = field(default_factory=lambda: np.zeros((0, 5)))
 
 
-class Standing(Stateful):
+class Standing(TrackRule):
     """Where echoes stood still that nothing explains.
 
     Parameters
     ----------
     turn : of `Antennas`: an echo from beyond the view is seen so far beside its direction
     walls : the mesh; None: nothing is known of it
+    velocity_period : span of unambiguous velocities [m/s]
     """
 
-    def __init__(self, turn: float, walls: Walls | None = None) -> None:
-        self._walls = walls
+    def __init__(self, turn: float, walls: Walls | None, velocity_period: float) -> None:
+        self._walls, self._period = walls, velocity_period
+        self._crowd = np.zeros(0, bool)
         self.state = Seen()
         steps = (0, -1, 1) if np.isfinite(turn) else (0,)
         by = [step * turn if step else 0.0 for step in steps]
@@ -72,14 +75,29 @@ class Standing(Stateful):
         cls, antennas: Antennas, waveform: Waveform, passes: int, walls: Walls | None
     ) -> Standing:
         """For the array of an active terminal (passes = 2) or a passive one."""
-        return cls(antennas.turn(waveform.wavelength, passes), walls)
+        period = Ambiguity.of(waveform, passes).period
+        return cls(antennas.turn(waveform.wavelength, passes), walls, period)
+
+    def births(self, detections: Detections, own: Own) -> Detections:
+        self._crowd = np.zeros(len(detections), bool)
+        if own.clutter_known:  # else the city's own echoes are among them
+            sender = None if own.transmitter is None else own.transmitter.mean[:6]
+            self._crowd = self.look(detections, own.pose, own.time, sender)
+        return replace(detections, starts=detections.starts & ~self._crowd)
+
+    def prune(self, tracker: Tracker, own: Own) -> None:
+        """End the tracks that stand still within a crowd or on a face, and those, not confirmed
+        before, that an echo of either carries on: from beyond the view and along a wall they seem
+        to move."""
+        fed = {t.id for t in tracker.tracks if t.detection >= 0 and self._crowd[t.detection]}
+        still = {t.id for t in tracker.tracks if self.holds(t)}
+        tracker.drop(still | (fed & own.tentative))
 
     def look(
         self,
         d: Detections,
         own: Pose,
         time: float,
-        period: float,
         sender: np.ndarray | None = None,
     ) -> np.ndarray:
         """Take down a frame's echoes that stand still, of those that may start a track. What would
@@ -88,7 +106,6 @@ class Standing(Stateful):
         Parameters
         ----------
         time : of the frame [s]
-        period : span of unambiguous velocities [m/s]
         sender : at a passive terminal (6,) of its transmitter, world coordinates
 
         Returns
@@ -102,7 +119,7 @@ class Standing(Stateful):
         towards = own.to_world(unit_vector(u))
         place, rate, speed = _still(d.range, towards, own, sender)
         off = d.velocity[:, None] - rate
-        off = np.where(real, np.abs(off - period * np.round(off / period)), np.inf)
+        off = np.where(real, np.abs(off - self._period * np.round(off / self._period)), np.inf)
         best = off.argmin(axis=1)  # the direction in which it would stand still
         each = np.arange(len(d))
         across = speed * np.linalg.norm(d.std[:, 2:], axis=1)
@@ -148,14 +165,6 @@ class Standing(Stateful):
         some = beside.sum(axis=1) >= CROWD
         some[some] = [_spots(self.state.echoes[near, 1:4]) >= CROWD for near in beside[some]]
         return some
-
-    def prune(self, tracker: Tracker, new: set[int], crowd: np.ndarray) -> None:
-        """End the tracks that stand still within a crowd or on a face, and those among `new`, not
-        confirmed before, that an echo (Q,) of either carries on: from beyond the view and along a
-        wall they seem to move."""
-        tracks = tracker.tracks
-        part = {t.id for t in tracks if t.detection >= 0 and crowd[t.detection]} & new
-        tracker.drop(part | {t.id for t in tracks if self.holds(t)})
 
     def holds(self, track: Track) -> bool:
         """Whether a track stands still, as far as is known of it, within a crowd or on a face, or

@@ -83,7 +83,6 @@ class Track:
     confirmed : M hits in N frames were reached, `SURE_HITS` of them sure
     detection : row among the frame's detections that updated it, -1: none
     last : time of the last detection [s]
-    echoed : frames in a row that it fits a nearer body's echo over a wall, or lies behind one
     sure : detections that could have started it
     """
 
@@ -96,7 +95,6 @@ class Track:
     confirmed: bool = False
     detection: int = -1
     last: float = -np.inf
-    echoed: int = 0
     sure: int = 1
 
     @classmethod

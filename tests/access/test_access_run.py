@@ -191,9 +191,9 @@ def test_feedback_undoes_a_slip(monkeypatch, feedback):
     terminal processes every second frame.
 
     Planted bug: the range moved the other way."""
-    from isac_rt.track import terminal
+    from isac_rt.track import reference, terminal
 
-    monkeypatch.setattr(terminal, "slip_cells", lambda ends, size: 0)
+    monkeypatch.setattr(reference, "slip_cells", lambda ends, size: 0)
     step, times = terminal.PassiveTerminal.step, []
 
     def slipping(self, cube, own_pose, time, modulated, **options):

@@ -13,8 +13,9 @@ from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.symbols.blind import Peaks, _comb, _Seen, acquire, find_peaks, read_peaks
+from isac_rt.track.reference import TerminalState
 from isac_rt.track.settings import Tracking
-from isac_rt.track.terminal import PassiveTerminal, TerminalState
+from isac_rt.track.standard import passive_terminal
 from isac_rt.world.swarm import Pose
 
 W = Waveform(num_samples=256, num_chirps=48)
@@ -207,7 +208,7 @@ def terminal(amplitude, groups=None):
     receivers = Receivers(link_acquisition="blind", symbol_decision="beams")
     free = ANTENNAS.gain * W.wavelength / (4 * np.pi * 25)
     sent = amplitude / free
-    return PassiveTerminal(W, ANTENNAS, receivers, Tracking(), ORDER, sent, groups)
+    return passive_terminal(W, ANTENNAS, receivers, Tracking(), ORDER, sent, groups)
 
 
 OWN = Pose.at_rest()
@@ -247,7 +248,7 @@ def test_a_terminal_reads_in_retrospect_and_goes_on():
             assert np.array_equal(reception.delay_symbols, sent[n].delay_symbols)
         last = read[5][1]
         assert last.line_of_sight == sees and bool(len(last.detections)) == sees
-        assert (whole.state == TerminalState.TRACKING) == sees
+        assert (whole.status == TerminalState.TRACKING) == sees
         parts = play(first, cubes[:1])
         assert not parts[0, 0].decoded
         second.restore(first.memory())
@@ -266,7 +267,7 @@ def test_a_path_is_found_again_within_what_was_predicted_of_it():
     for std, back in ((0.34, True), (0.1, False)):
         receiver = terminal(5.0)
         play(receiver, cubes[:4])
-        kept = receiver._retrospect
+        kept = receiver.equipment.other_paths
         path, off = kept.state.path, 0.53 * cell
         mean = path.mean + np.array([0.0, off, 0.0])
         covariance = np.diag([1e-3, (std * cell) ** 2, 1e-2])
@@ -287,7 +288,7 @@ def test_a_line_of_sight_at_the_edge_of_the_view_carries_data_only():
     cubes = [cube(W, schedule, p, [q], noise=0.1) for p, q in zip(sent, paths, strict=True)]
     heard = play(receiver, cubes)
     assert heard[2, 2].decoded and np.array_equal(heard[2, 2].bits, sent[2].bits)
-    assert not heard[2, 2].line_of_sight and receiver.reference is None
+    assert not heard[2, 2].line_of_sight and receiver.reference.track is None
 
 
 def test_a_terminal_reads_its_own_groups_late():

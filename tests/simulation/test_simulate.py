@@ -20,7 +20,7 @@ from isac_rt.results.files import open_results, save
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare
-from isac_rt.track.terminal import PassiveTerminal
+from isac_rt.track.standard import passive_terminal
 
 SCENES = Path(__file__).parents[2] / "scenes"
 FRAMES = {"frames": 6}
@@ -103,7 +103,7 @@ def test_receivers_use_no_truth(tmp_path):
         SCENES / "paper_swarm_consistent.yaml", ["modulation.acquisition_frames=1"], frames=3
     )
     setup = prepare(scenario)
-    live = PassiveTerminal(
+    live = passive_terminal(
         setup.waveform, setup.antennas, scenario.receivers, scenario.tracking, 8, 1.0
     )
     steps, expected = [], {}

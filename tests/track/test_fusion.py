@@ -18,7 +18,6 @@ from isac_rt.track.fusion import (
     DATUM_STD,
     ERRORS,
     OWN_NOISE,
-    POSE_STD,
     Key,
     Name,
     Picture,
@@ -32,9 +31,9 @@ from isac_rt.track.fusion import (
     intersection,
     intersection_of,
     its_word,
-    of_itself,
     together,
 )
+from isac_rt.track.parts import POSE_STD, of_itself
 from isac_rt.track.tracker import TrackSet
 from isac_rt.world.swarm import Pose
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from isac_rt.track.filter import Ambiguity, Gaussian
-from isac_rt.track.ghosts import Leeway, Walls, echoes, reflections, suspicion
+from isac_rt.track.ghosts import Leeway, echoes, reflections, suspicion
 from isac_rt.track.tracker import Track, track_set
+from isac_rt.track.walls import Walls
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 

@@ -13,10 +13,11 @@ import trimesh
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.track.filter import Ambiguity, Gaussian
-from isac_rt.track.ghosts import Leeway, Walls, echoes, reflections, suspicion
-from isac_rt.track.images import Doubts
+from isac_rt.track.ghosts import Ghosts, Leeway, echoes, reflections, suspicion
+from isac_rt.track.parts import KnownBody, Own
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import Track, Tracker, track_set
+from isac_rt.track.walls import Walls
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 from reproduce.ghosts import explained_tracks, run, verdicts, whole_tracks
@@ -173,14 +174,15 @@ def test_a_confirmed_echo_ends_once_its_body_is_known_three_frames():
     image = BODY[:3] * [-1, 1, 1] + [2 * WALL_X, 0, 0]
     w = Waveform()
     antennas = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
-    doubts = Doubts(Walls(wall()), antennas, w)
+    leeway = Leeway.of(w, antennas, 2)
     body = [Gaussian(np.concatenate([BODY[:3] + ORIGIN, BODY[3:]]), np.eye(6) * 1e-4)]
     for told, left in (((body,) * 3, 0), ((body, body, [], body, body), 1)):
         tracker = Tracker(Tracking(), Ambiguity(PERIOD))
         tracker.state.tracks = [track(5, image, BODY[3:] * [-1, 1, 1])]
+        ghosts = Ghosts(Walls(wall()), leeway)
         for known in told:
             assert len(tracker.tracks) == 1
-            doubts.remove_ghosts(tracker, set(), OWN, told=known)
+            ghosts.prune(tracker, Own(OWN, 0.0, reports=[KnownBody("", b) for b in known]))
         assert len(tracker.tracks) == left
 
 
@@ -194,13 +196,16 @@ def test_a_confirmed_track_that_goes_behind_a_wall_ends(depth, std, frames):
     asked; deviations left out; it ends at once."""
     w = Waveform()
     antennas = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
-    doubts, tracker = Doubts(Walls(wall()), antennas, w), Tracker(Tracking(), Ambiguity(PERIOD))
+    ghosts, tracker = (
+        Ghosts(Walls(wall()), Leeway.of(w, antennas, 2)),
+        Tracker(Tracking(), Ambiguity(PERIOD)),
+    )
     one = track(5, np.array([WALL_X + depth, 24.0, 5.0]), np.zeros(3))
     one.state = Gaussian(one.state.mean, np.diag([std**2] * 3 + [1e-2] * 3))
     tracker.state.tracks = [one]
     ended = None
     for frame in range(1, 5):
-        doubts.remove_ghosts(tracker, set(), OWN)
+        ghosts.prune(tracker, Own(OWN, 0.0))
         ended = frame if ended is None and not tracker.tracks else ended
     assert ended == frames
 

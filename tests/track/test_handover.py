@@ -17,14 +17,10 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Reception, no_detections
 from isac_rt.track.filter import Gaussian
+from isac_rt.track.reference import Followed, TerminalState, slip_cells
 from isac_rt.track.settings import Tracking
-from isac_rt.track.terminal import (
-    ActiveTerminal,
-    PassiveTerminal,
-    Surroundings,
-    TerminalState,
-    slip_cells,
-)
+from isac_rt.track.standard import active_terminal, passive_terminal
+from isac_rt.track.terminal import PassiveTerminal
 from isac_rt.track.tracker import Track
 from isac_rt.world.swarm import Pose
 
@@ -99,12 +95,13 @@ class Told:
 def passive(answers=(), state: Gaussian | None = None, **settings) -> tuple[PassiveTerminal, Told]:
     """A passive terminal with a told receiver and, if there is a state, a reference of this state
     at time 0."""
-    pt = PassiveTerminal(W, STEERED, Receivers(), Tracking(**settings), 8, AMPLITUDE)
+    pt = passive_terminal(W, STEERED, Receivers(), Tracking(**settings), 8, AMPLITUDE)
     told = Told(list(answers))
     vars(pt)["receive"] = told  # in place of the method
     if state is not None:
-        pt.reference = Track(pt.tracker.new_id(), state, 80.0, confirmed=True)
-        pt.state, pt._time, pt.tracker.state.time = TerminalState.TRACKING, -1e-6, -1e-6
+        track = Track(pt.tracker.new_id(), state, 80.0, confirmed=True)
+        pt.reference.state = Followed(track, -1e-6, TerminalState.TRACKING)
+        pt.tracker.state.time = -1e-6
     return pt, told
 
 
@@ -168,7 +165,7 @@ def test_what_is_reported_has_the_deviations_of_its_state():
     pt, _ = passive([heard()], known(0.3, 0.7))
     body = Gaussian(BODY, 1.7 * known(0.5, 0.9).covariance)
     pt.tracker.state.tracks = [Track(5, body, 20.0, confirmed=True)]
-    tracks = pt.tracker.snapshot(own, pt.reference)
+    tracks = pt.tracker.snapshot(own, pt.reference.track)
     H = slopes(lambda s: what_is_measured(s, own, SENDER), BODY).astype(float)
     J = slopes(lambda s: what_is_measured(BODY, own, s), SENDER).astype(float)
     first = slopes(lambda s: what_is_measured(s, own), SENDER).astype(float)
@@ -180,7 +177,7 @@ def test_what_is_reported_has_the_deviations_of_its_state():
     z = np.column_stack([tracks.range, tracks.velocity, tracks.direction])[1]
     assert z == pytest.approx(np.asarray(what_is_measured(BODY, own, SENDER), float), abs=1e-9)
     pt.step(EMPTY, OWN, 0.01, False)
-    assert pt.tracker.snapshot(OWN, pt.reference).age.tolist() == [1, 0]
+    assert pt.tracker.snapshot(OWN, pt.reference.track).age.tolist() == [1, 0]
 
 
 @pytest.mark.parametrize(("cells", "told_range"), [(0.19, True), (0.21, False)])
@@ -214,8 +211,10 @@ def test_a_line_of_sight_is_as_strong_as_friis_says(level_db, believed, modulate
         pt, _ = passive([answer], state)
         reception, _ = pt.step(EMPTY, OWN, 1e-3, modulated)
         assert reception.line_of_sight is believed
-        assert pt.state is (TerminalState.TRACKING if believed else TerminalState.LOST)
-        assert pt.reference is not None and pt.reference.missed == (0 if believed else 1)
+        assert pt.status is (TerminalState.TRACKING if believed else TerminalState.LOST)
+        assert pt.reference.track is not None and pt.reference.track.missed == (
+            0 if believed else 1
+        )
 
 
 def test_acquiring_tracking_lost():
@@ -225,7 +224,7 @@ def test_acquiring_tracking_lost():
     said = []
     for k in range(4):
         pt.step(EMPTY, OWN, 0.02 * k, False)
-        said.append(pt.state)
+        said.append(pt.status)
     assert said == [
         TerminalState.ACQUIRING,
         TerminalState.TRACKING,
@@ -245,11 +244,11 @@ def test_the_reference_keeps_a_floor_of_its_error():
     H = slopes(lambda s: what_is_measured(s, OWN), SENDER).astype(float)
     R = np.diag([0.02 * CELL, 0.02 * BIN, 2e-4, 2e-4]) ** 2  # cosines: no detection is better
     truth = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H)
-    assert pt.reference is not None
-    assert H @ pt.reference.state.covariance @ H.T == pytest.approx(
+    assert pt.reference.track is not None
+    assert H @ pt.reference.track.state.covariance @ H.T == pytest.approx(
         H @ truth @ H.T, rel=1e-3, abs=1e-10
     )
-    assert pt.reference.snr == 50.0
+    assert pt.reference.track.snr == 50.0
 
 
 @pytest.mark.parametrize(
@@ -280,8 +279,10 @@ def test_how_far_off_a_reference_may_be(off, spread, believed, periods):
     z[0] -= periods * W.num_chirps * BIN * MIDDLE / W.slope  # the same beat
     pt, _ = passive([heard(z)], Gaussian(SENDER.copy(), P))
     pt.step(EMPTY, OWN, 0.0, True)
-    assert pt.reference is not None and pt.state is TerminalState.TRACKING
-    assert (pt.reference.missed, pt.reference.snr) == ((0, 50.0) if believed else (1, 80.0))
+    assert pt.reference.track is not None and pt.status is TerminalState.TRACKING
+    assert (pt.reference.track.missed, pt.reference.track.snr) == (
+        (0, 50.0) if believed else (1, 80.0)
+    )
 
 
 @pytest.mark.parametrize(
@@ -296,9 +297,9 @@ def test_a_pilot_in_another_cell_starts_anew(cells, modulated, anew):
         Track(pt.tracker.new_id(), Gaussian(BODY, known().covariance), 20.0, confirmed=True)
     ]
     _, tracks = pt.step(EMPTY, OWN, 0.0, modulated)
-    assert pt.reference is not None
-    assert pt.reference.id == (2 if anew else 0)
-    assert pt.reference.confirmed and pt.reference.age == (0 if anew else 1)
+    assert pt.reference.track is not None
+    assert pt.reference.track.id == (2 if anew else 0)
+    assert pt.reference.track.confirmed and pt.reference.track.age == (0 if anew else 1)
     assert tracks.ids.tolist() == ([2] if anew else [0, 1])
 
 
@@ -307,19 +308,19 @@ def test_patience_has_an_end():
     one that was believed begins the count anew. Planted bugs: no end; one too few."""
     for believed_first, frames, anew in ((False, 25, False), (False, 26, True), (True, 26, False)):
         pt, told = passive([], known(0.001, 0.001))
-        assert pt.reference is not None
+        assert pt.reference.track is not None
         # a track at rest about the line of sight, so that time changes nothing
-        pt.reference.state.mean[3:] = 0
-        pt.reference.state.covariance[3:] = pt.reference.state.covariance[:, 3:] = 0
+        pt.reference.track.state.mean[3:] = 0
+        pt.reference.track.state.covariance[3:] = pt.reference.track.state.covariance[:, 3:] = 0
         z = sight() * [1, 0, 1, 1]
         told.answers = [heard(z + np.array([0.5 * CELL, 0, 0, 0]))] * (frames + 1)
         if believed_first:
             told.answers[12] = heard(z)
         for k in range(frames):
             pt.step(EMPTY, OWN, 1e-6 * k, True)
-        assert pt.reference.missed == (frames if not believed_first else frames - 13)
+        assert pt.reference.track.missed == (frames if not believed_first else frames - 13)
         pt.step(EMPTY, OWN, 1e-6 * frames, False)
-        assert (pt.reference.id != 0) is anew
+        assert (pt.reference.track.id != 0) is anew
 
 
 def test_reflectors_are_tracked_by_way_of_the_sender_while_it_is_in_sight():
@@ -372,9 +373,9 @@ def test_a_slip_is_repaired_and_the_frame_read_again():
         assert modulated and second.range[0] - first.range[0] == pytest.approx(-2 * CELL, abs=1e-9)
         assert second.velocity[0] == pytest.approx(first.velocity[0], abs=1e-9)
         assert second.direction[0] == pytest.approx(first.direction[0], abs=1e-12)
-        assert pt.slips_repaired == (0 if kept else 1)
+        assert pt.reference.state.slips_repaired == (0 if kept else 1)
         assert reception.raw_delay_symbols[0, 0] == (-2 if kept else 60)
-        length = np.linalg.norm(pt.reference.state.mean[:3] - OWN.position)
+        length = np.linalg.norm(pt.reference.track.state.mean[:3] - OWN.position)
         assert length == pytest.approx(sight()[0] - (0 if kept else 2 * CELL), abs=1e-3)
     for symbols, sure in (
         ([-2], 100.0),
@@ -394,22 +395,22 @@ def test_evidence_of_a_slip_is_gathered_over_twelve_frames():
     correction."""
     for gap, told_once in ((11, False), (12, True)):
         pt, told = passive([], known(1e-4, 1e-4))
-        pt.reference.state.mean[3:] = 0
+        pt.reference.track.state.mean[3:] = 0
         z = sight() * [1, 0, 1, 1]
         symbols = [[-1], *[[]] * (gap - 1), [-1]]
         told.answers = [read(s, z) for s in symbols] + [read([], z - np.array([CELL, 0, 0, 0]))]
         for k in range(gap + 1):
             pt.step(EMPTY, OWN, 1e-6 * k, True)
-        assert pt.slips_repaired == (0 if told_once else 1)
+        assert pt.reference.state.slips_repaired == (0 if told_once else 1)
     pt, told = passive([], known(1e-4, 1e-4))
-    pt.reference.state.mean[3:] = 0
+    pt.reference.track.state.mean[3:] = 0
     told.answers = [read([-1], z), read([-1], z - np.array([CELL, 0, 0, 0]))]
     pt.step(EMPTY, OWN, 0.0, True)
     pt.shorten(1, OWN)
-    length = np.linalg.norm(pt.reference.state.mean[:3] - OWN.position)
+    length = np.linalg.norm(pt.reference.track.state.mean[:3] - OWN.position)
     assert length == pytest.approx(z[0] - CELL, abs=1e-3)
     pt.step(EMPTY, OWN, 1e-6, True)
-    assert pt.slips_repaired == 0
+    assert pt.reference.state.slips_repaired == 0
 
 
 def test_a_slip_is_the_least_move_that_fits_the_alphabet():
@@ -431,7 +432,7 @@ def test_an_active_terminal_hands_its_clutter_on_and_folds_its_echoes():
     the velocity. Planted bugs: clutter dropped; the period of one pass; half a period."""
     period = 299_792_458.0 / MIDDLE / (2 * W.slot_duration)
     clutter = ExpectedClutter(*(np.zeros(0),) * 3, *(np.zeros((0, 3)),) * 2)
-    at = ActiveTerminal(W, ANTENNAS, Receivers(), Tracking())
+    at = active_terminal(W, ANTENNAS, Receivers(), Tracking())
     z = np.asarray(what_is_measured(BODY, OWN), float)
     fold = np.array([-MIDDLE / W.slope, 1, 0, 0]) * period  # the same beat
     told = Told([heard(None, [z + whole * fold]) for whole in (0, -1, 2)])
@@ -467,10 +468,10 @@ def test_mistakes_that_a_frame_shows_are_corrected_in_the_next():
     first = Correction(0.2 * np.log(10), np.array([0.3, 0.0, 0.0]))
     second = Correction(-0.05 * np.log(10), np.array([0.0, 0.2, 0.0]))
     told = Told([heard(correction=c) for c in (first, None, second, None)])
-    at: Any = ActiveTerminal(W, ANTENNAS, Receivers(), Tracking())
+    at: Any = active_terminal(W, ANTENNAS, Receivers(), Tracking())
     for k in range(4):
         if k == 3:
-            kept, at = at.memory(), ActiveTerminal(W, ANTENNAS, Receivers(), Tracking())
+            kept, at = at.memory(), active_terminal(W, ANTENNAS, Receivers(), Tracking())
             at.restore(kept)
         vars(at)["receive"] = told  # in place of the method
         at.step(EMPTY, None, OWN, 1e-6 * k, clutter=clutter)
@@ -494,7 +495,7 @@ def test_the_word_of_data_counts_from_the_frame_after_they_were_read_to_one_that
         return ExpectedClutter(*np.zeros((3, 0)), *np.zeros((2, 0, 3)))
 
     pt, _ = passive([heard(z), read((), z), *[heard(z)] * 3], known(1e-3, 1e-3))
-    pt._surroundings = Surroundings(None, clutter)
+    pt.equipment = replace(pt.equipment, expect_clutter=clutter)
     word = Pose(SENDER[:3] + np.array([1.0, 0, 0]), SENDER[3:6], np.zeros(3), np.eye(3))
     for n, modulated in enumerate([False, True, False, True, True]):
         pt.step(EMPTY, OWN, n * 1e-4, modulated, sender=word)

@@ -9,10 +9,11 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import Ambiguity
-from isac_rt.track.ghosts import Walls
-from isac_rt.track.images import Doubts, _by_one, _by_two, own_images, sender_images
+from isac_rt.track.images import Images, _by_one, _by_two, own_images, sender_images
+from isac_rt.track.parts import Own
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import Tracker
+from isac_rt.track.walls import Walls
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, attitude
 
@@ -194,13 +195,13 @@ def test_images_and_aliases_start_no_track():
     two cells off; at the edge of the view. Planted bugs: range alone decides; velocities not
     folded."""
     cell, period = W.range_cell(2), 2 * W.max_velocity(2)
-    found = Doubts(city(WALL), ANTENNAS, W).births(
+    found = Images(city(WALL), ANTENNAS, W, 2).births(
         detections(
             [9.6 + cell, 9.6, 9.6 + 2 * cell, 9.6, 30.0],
             [-0.6, -0.6 + period, -0.6, 1.2, 3.0],
             [0.2, 0.2, 0.2, 0.2, 0.85],
         ),
-        OWN,
+        Own(OWN, 0.0),
     )
     assert found.starts.tolist() == [False, False, True, True, False]
 

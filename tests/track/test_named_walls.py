@@ -13,8 +13,10 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import Gaussian, measure
+from isac_rt.track.parts import Own, follow
+from isac_rt.track.reference import Followed
 from isac_rt.track.settings import Tracking
-from isac_rt.track.terminal import PassiveTerminal, Surroundings
+from isac_rt.track.standard import Surroundings, passive_terminal
 from isac_rt.track.tracker import Track
 from isac_rt.world.swarm import Pose
 
@@ -57,7 +59,7 @@ def test_a_path_over_a_wall_is_named(said, named):
     free = ANTENNAS.gain * W.wavelength / (4 * np.pi * np.linalg.norm(IMAGE - OWN.position))
     receivers = Receivers(link_acquisition="blind", symbol_decision="beams")
     around = Surroundings(city(WALL))
-    terminal = PassiveTerminal(
+    terminal = passive_terminal(
         W, ANTENNAS, receivers, Tracking(), 8, 5.0 / free, None, surroundings=around
     )
     for n in range(7):
@@ -69,7 +71,7 @@ def test_a_path_over_a_wall_is_named(said, named):
         sender = None if place is None else Pose(place, VELOCITY, np.zeros(3), np.eye(3))
         heard, tracks = terminal.step(received, own, n * INTERVAL, True, sender=sender)
     assert heard.decoded and np.array_equal(heard.bits, payload.bits)
-    assert not heard.line_of_sight and terminal.reference is None
+    assert not heard.line_of_sight and terminal.reference.track is None
     assert heard.placed == named
     d = heard.detections
     if not named:
@@ -101,13 +103,13 @@ def test_the_city_is_expected_from_where_the_data_say(read):
         asked.append(state)
         raise Asked
 
-    terminal = PassiveTerminal(
+    terminal = passive_terminal(
         W, ANTENNAS, Receivers(), Tracking(), 8, 1.0, surroundings=Surroundings(None, clutter)
     )
     told = Pose(SENDER, VELOCITY, np.zeros(3), np.eye(3))
     off = np.array([1.0, 0.0, 0.0, 0.0, 1.2, 0.0])
     tracked = Gaussian(np.concatenate([SENDER, VELOCITY]) + off, np.eye(6) * 1e-4)
-    terminal.reference, terminal._time, terminal._read = Track.of_body(tracked), 0.0, read
+    terminal.reference.state = Followed(Track.of_body(tracked), 0.0, read=read)
     with pytest.raises(Asked):
         terminal.step(None, OWN, 0.0, True, sender=told)
     expected = tracked.mean - off * read
@@ -121,7 +123,7 @@ def test_a_terminal_that_is_told_of_others_waits_for_their_word(word, first, mon
     step that does not ask whether data say where the transmitter is."""
     around = Surroundings(city([[x + 200.0, y, z] for x, y, z in WALL]))
     tracking = Tracking(births="unexplained")
-    terminal = PassiveTerminal(W, ANTENNAS, Receivers(), tracking, 8, 1.0, surroundings=around)
+    terminal = passive_terminal(W, ANTENNAS, Receivers(), tracking, 8, 1.0, surroundings=around)
     sender = Track.of_body(Gaussian(np.concatenate([SENDER, VELOCITY]), np.eye(6) * 1e-6))
     flies = np.concatenate([TARGET, VELOCITY + np.array([1.0, 0.0, 0.0])])
     z = measure(flies, OWN, sender.state.mean)
@@ -134,18 +136,10 @@ def test_a_terminal_that_is_told_of_others_waits_for_their_word(word, first, mon
         is_reference=np.zeros(1, bool),
         starts=np.ones(1, bool),
     )
-    monkeypatch.setattr(terminal, "_expected_clutter", lambda own: _raise(Asked))
-    with pytest.raises(Asked):  # nothing is received here
-        terminal.step(
-            None,
-            OWN,
-            0.0,
-            True,
-            sender=Pose(SENDER, VELOCITY, np.zeros(3), np.eye(3)) if word else None,
-        )
     confirmed = []
+    own = Own(OWN, 0.0, cooperates=word, reference=sender)
     for n in range(7):
         terminal.tracker.predict(1e-6 * n)
-        terminal._track(found, OWN, sender, ())
+        follow(terminal.tracker, terminal.equipment.rules, found, own)
         confirmed += [n] * terminal.tracker.tracks[0].confirmed
     assert confirmed == [*range(first, 7)]

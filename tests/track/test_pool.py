@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from isac_rt.storage import pack, unpack
 from isac_rt.track.filter import Ambiguity, measure
-from isac_rt.track.fusion import ATTITUDE_STD, POSE_STD, Key, Name
+from isac_rt.track.fusion import ATTITUDE_STD, Key, Name
+from isac_rt.track.parts import POSE_STD
 from isac_rt.track.pool import ERRORS, POSE, Lives, Look, Pool, PooledTracker, _View
 from isac_rt.track.settings import Tracking
 from isac_rt.world.swarm import Pose

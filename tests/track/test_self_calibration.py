@@ -22,7 +22,7 @@ from isac_rt.track.filter import Gaussian
 from isac_rt.track.self_calibration import FREE, Change, SelfCalibration, Sight
 from isac_rt.track.settings import Tracking
 from isac_rt.track.sights import seen_after
-from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
+from isac_rt.track.standard import active_terminal, passive_terminal
 from isac_rt.world.swarm import Pose
 
 C = 299_792_458.0
@@ -223,7 +223,7 @@ def test_samples_are_corrected_to_those_of_ideal_hardware():
     factor and -30 dB; by a ten times larger share without the slopes. Planted bugs: the delay put
     in and not taken out, the response of the wrong antenna, modes of the wrong parity."""
     late, mate = 0.456e-9 * C, np.array([0.11, -0.23])
-    at = ActiveTerminal(W, ANTENNAS, Receivers(self_calibration="positions"), Tracking())
+    at = active_terminal(W, ANTENNAS, Receivers(self_calibration="positions"), Tracking())
     payload = random_payload(W, SCHEDULE, 8, np.random.default_rng(2))
     truth = cube(W, SCHEDULE, payload, [echo(6.37, mate)])
     path = replace(echo(6.37, mate), length=2 * 6.37 + late)
@@ -234,13 +234,12 @@ def test_samples_are_corrected_to_those_of_ideal_hardware():
         at.step(heard, payload, OWN, 0.05 * frame, mates=poses)
     clean = cube(W, SCHEDULE, payload, [path])
     clean = replace(clean, samples=bent(clean.samples, np.random.default_rng(5), SCHEDULE))
-    assert at.calibration is not None
-    found = at.calibration.correct(clean, 0.5).samples
+    found = at.equipment.hardware.correct(clean, 0.5).samples
     inside = slice(12, -12)  # a window of Hann sees next to nothing of the ends
     a, b = found[..., inside].ravel(), truth.samples[..., inside].ravel()
     factor = np.vdot(b, a) / np.vdot(b, b)
     assert 10 * np.log10(np.mean(np.abs(a / factor - b) ** 2)) < -30
-    assert at.calibration.state.clock[0] == pytest.approx(0.456e-9, abs=0.02e-9)
+    assert at.equipment.hardware.state.clock[0] == pytest.approx(0.456e-9, abs=0.02e-9)
 
 
 def test_a_passive_terminal_finds_clock_and_gains_in_its_line_of_sight():
@@ -249,7 +248,7 @@ def test_a_passive_terminal_finds_clock_and_gains_in_its_line_of_sight():
     turned the wrong way, the clock's rate not taken out."""
     u, rng, w = np.array([-0.17, 0.08]), np.random.default_rng(21), replace(W, num_samples=256)
     settings = Receivers(self_calibration="positions")
-    pt = PassiveTerminal(w, ANTENNAS, settings, Tracking(), 8, 1.0)
+    pt = passive_terminal(w, ANTENNAS, settings, Tracking(), 8, 1.0)
     gains, level = errors(rng, 15), ANTENNAS.gain * w.wavelength / (4 * np.pi) / 20.0
     for frame in range(8):
         late = 31e-9 + 2e-9 * 0.05 * frame
@@ -265,8 +264,7 @@ def test_a_passive_terminal_finds_clock_and_gains_in_its_line_of_sight():
         assert np.linalg.norm(tracks.mean[0, 3:]) < 2
         if modulated:
             assert (reception.delay_symbols == data.delay_symbols).mean() > 0.99
-    assert pt.calibration is not None
-    assert pt.calibration.state.clock == pytest.approx([late, 2e-9], abs=2e-10)
+    assert pt.equipment.hardware.state.clock == pytest.approx([late, 2e-9], abs=2e-10)
     assert tracks.range[0] == pytest.approx(20.0, abs=0.05)
     assert tracks.velocity[0] == pytest.approx(0.0, abs=0.1)
     assert reception.detections.direction[0] == pytest.approx(u, abs=2e-3)
@@ -317,7 +315,7 @@ def test_ten_frames_of_samples_bring_angles_within_1_db_of_the_bound():
         rng = np.random.default_rng(seed)
         sent, heard = errors(rng, 3), errors(rng, 15)
         gain = heard[None, :, None] * sent[SCHEDULE][:, None, :]
-        at = ActiveTerminal(W, ANTENNAS, settings, Tracking())
+        at = active_terminal(W, ANTENNAS, settings, Tracking())
         for frame in range(14):
             u = rng.uniform(-0.5, 0.5, (3, 2))
             places = (6.3, 0.0, *u[0]), (8.6, 0.0, *u[1]), (11.7, 2.0, *u[2])

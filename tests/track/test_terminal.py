@@ -18,9 +18,11 @@ from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
 from isac_rt.track.filter import Gaussian
-from isac_rt.track.fusion import KnownBody, of_itself
+from isac_rt.track.parts import KnownBody, Own, of_itself
+from isac_rt.track.reference import TerminalState
 from isac_rt.track.settings import Tracking
-from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal, TerminalState
+from isac_rt.track.standard import active_terminal, expected_targets, passive_terminal
+from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
 from isac_rt.track.tracker import Track
 from isac_rt.world.swarm import Pose, attitude
 
@@ -51,7 +53,7 @@ def heard(frame: int, paths: list[Path], modulated: bool, snr_db: float = 5.0):
 
 
 def terminal() -> PassiveTerminal:
-    return PassiveTerminal(W, ANTENNAS, Receivers(), Tracking(), 8, 1.0)
+    return passive_terminal(W, ANTENNAS, Receivers(), Tracking(), 8, 1.0)
 
 
 def step(pt: PassiveTerminal, frame: int, paths: list[Path], modulated: bool):
@@ -64,7 +66,7 @@ def acquired(frames: int = 2) -> PassiveTerminal:
     pt = terminal()
     for frame in range(frames):
         step(pt, frame, [sight(frame)], False)
-    assert pt.state is TerminalState.TRACKING
+    assert pt.status is TerminalState.TRACKING
     return pt
 
 
@@ -89,7 +91,7 @@ def test_acquires_from_pilots_then_decodes():
 def test_nothing_is_read_before_acquisition():
     pt = terminal()
     reception, _, _ = step(pt, 0, [sight(0)], True)
-    assert pt.state is TerminalState.ACQUIRING
+    assert pt.status is TerminalState.ACQUIRING
     assert not reception.decoded
 
 
@@ -97,19 +99,19 @@ def test_a_weak_reflection_is_not_taken_for_the_line_of_sight():
     """14 dB under free space at its own length; planted bug: `_plausible` always true."""
     pt = terminal()
     step(pt, 0, [sight(0, scale=0.2)], False)
-    assert pt.state is TerminalState.ACQUIRING
-    assert pt.reference is None
+    assert pt.status is TerminalState.ACQUIRING
+    assert pt.reference.track is None
 
 
 def test_says_that_it_lost_the_line_of_sight_and_comes_back():
     pt = acquired()
     for frame in (2, 3, 4):
         reception, _, _ = step(pt, frame, [], True)
-        assert pt.state is TerminalState.LOST
+        assert pt.status is TerminalState.LOST
         assert not reception.decoded
         assert not reception.line_of_sight
     reception, _, payload = step(pt, 5, [sight(5)], True)
-    assert pt.state is TerminalState.TRACKING
+    assert pt.status is TerminalState.TRACKING
     assert (reception.delay_symbols == payload.delay_symbols).all()
 
 
@@ -119,7 +121,7 @@ def test_a_reflection_in_the_shadow_is_not_the_line_of_sight():
     pt = acquired()
     late = replace(sight(2, scale=0.2), length=LENGTH + 3.3 * W.range_cell(1))
     step(pt, 2, [late], True)
-    assert pt.state is TerminalState.LOST
+    assert pt.status is TerminalState.LOST
 
 
 @pytest.mark.parametrize("cells", [-3, -1, 1, 3])
@@ -128,30 +130,30 @@ def test_planted_slips_are_repaired_while_data_flow(cells):
     128 symbols, so a slip of one cell shows in 1 - (1 - 1/128)^108 = 57 % of the frames; ten frames
     miss it with probability 2e-4 (seeds are fixed). Planted bug: the sign of the move."""
     pt = acquired(3)
-    assert pt.reference is not None
-    state = pt.reference.state
+    assert pt.reference.track is not None
+    state = pt.reference.track.state
     span = state.mean[:3] - OWN.position
     state.mean[:3] += cells * W.range_cell(1) * span / np.linalg.norm(span)
     for frame in range(3, 13):
         reception, _, payload = step(pt, frame, [sight(frame)], True)
         if (reception.delay_symbols == payload.delay_symbols).all():
             break
-    assert pt.slips_repaired >= 1
+    assert pt.reference.state.slips_repaired >= 1
     assert (reception.delay_symbols == payload.delay_symbols).all()
 
 
 def test_a_pilot_anchors_the_range_again():
     pt = acquired(3)
-    assert pt.reference is not None
-    span = pt.reference.state.mean[:3] - OWN.position
-    pt.reference.state.mean[:3] += 5 * W.range_cell(1) * span / np.linalg.norm(span)
+    assert pt.reference.track is not None
+    span = pt.reference.track.state.mean[:3] - OWN.position
+    pt.reference.track.state.mean[:3] += 5 * W.range_cell(1) * span / np.linalg.norm(span)
     step(pt, 3, [sight(3)], False)
     reception, _, payload = step(pt, 4, [sight(4)], True)
     assert (reception.delay_symbols == payload.delay_symbols).all()
 
 
 def test_the_active_terminal_tracks_an_echo():
-    at = ActiveTerminal(W, ANTENNAS, Receivers(), Tracking())
+    at = active_terminal(W, ANTENNAS, Receivers(), Tracking())
     for frame in range(5):
         length = 2 * (17.31 + 1.7 * INTERVAL * frame)
         samples, payload = heard(
@@ -174,7 +176,7 @@ def test_a_capture_is_all_that_a_terminal_needs(tmp_path, active):
         heard(f, [replace(sight(f), length=scale * sight(f).length, departure=ARRIVAL)], f > 1)
         for f in range(4)
     ]
-    live = ActiveTerminal(W, ANTENNAS, Receivers(), Tracking()) if active else terminal()
+    live = active_terminal(W, ANTENNAS, Receivers(), Tracking()) if active else terminal()
     steps = [
         Step(samples, OWN, f * INTERVAL, f > 1, payload if active else None)
         for f, (samples, payload) in enumerate(frames)
@@ -202,7 +204,7 @@ def test_the_active_terminal_expects_its_tracks_and_its_mates_where_they_are():
     or is no terminal, nor where it is not asked for.
     Planted bugs: gates of the frame before; one of every body that it was told of."""
     rule = Receivers(clutter_detector="angle_doppler", gate_false_alarm_rate=1e-3)
-    at = ActiveTerminal(W, ANTENNAS, rule, Tracking())
+    at = active_terminal(W, ANTENNAS, rule, Tracking())
     own = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
     mate = replace(own, position=np.array([0.0, 20.0, 0.0]), velocity=np.array([0.0, 3.0, 0.0]))
     body = Gaussian(np.array([0.0, 30.0, 0, 0, -4.0, 0, 0, 0, 0]), 0.01 * np.eye(9))
@@ -211,8 +213,9 @@ def test_the_active_terminal_expects_its_tracks_and_its_mates_where_they_are():
     at.tracker.state.time = 0.0
     at.tracker.predict(0.5)
     told = [KnownBody("PT", of_itself(mate)), KnownBody("", of_itself(own))]
-    sought = at._sought(own, told)
+    assert at.equipment.expect_targets is expected_targets
+    sought = expected_targets(at.tracker, Own(own, 0.5, reports=told))
     np.testing.assert_allclose(sought.mean, [[28, -4, 0, 0], [20, 3, 0, 0]], atol=1e-9)
     np.testing.assert_allclose(sought.std[1, :2], 0.05 * np.sqrt(2))
-    plain = ActiveTerminal(W, ANTENNAS, Receivers(clutter_detector="angle_doppler"), Tracking())
-    assert plain._sought(own, told) is None
+    plain = active_terminal(W, ANTENNAS, Receivers(clutter_detector="angle_doppler"), Tracking())
+    assert plain.equipment.expect_targets is None

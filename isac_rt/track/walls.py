@@ -1,0 +1,150 @@
+"""The planes of a city's mesh as a terminal uses them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from isac_rt.kernels.jit import jit
+from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.swarm import Pose
+
+SMALLEST_WALL = 8.0
+"""Area of a plane's faces together [m^2] below which it is not taken for a mirror: bays and gables
+of 10 m^2 showed UAVs over San Francisco."""
+
+
+@dataclass(frozen=True)
+class Walls:
+    """A mesh as a terminal uses it, in world coordinates."""
+
+    city: CityMesh
+
+    @cached_property
+    def mirrors(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Largest face (W,), unit normal (W, 3) and offset n.x (W,) [m] of the planes of
+        `SMALLEST_WALL` and more."""
+        plane, areas = self.city.plane_of_face, self.city.areas
+        largest_first = np.lexsort((-areas, plane))
+        planes, first = np.unique(plane[largest_first], return_index=True)
+        total = np.bincount(plane, weights=areas)
+        faces = largest_first[first[total[planes] >= SMALLEST_WALL]]
+        normals = self.city.normals[faces]
+        return faces, normals, self.city.plane_offsets[faces] + normals @ self.city.origin
+
+    @cached_property
+    def planes(self) -> np.ndarray:
+        """(W,) numbers of the mirrors' planes in the mesh."""
+        return self.city.plane_of_face[self.mirrors[0]]
+
+    @cached_property
+    def _faces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Faces of the mirrors one after the other, where each mirror's begin, and the lowest and
+        highest corner of each (2, W, 3), world coordinates."""
+        plane = self.city.plane_of_face
+        order = np.argsort(plane, kind="stable")
+        faces = order[np.isin(plane[order], self.planes)]
+        first = np.append(np.searchsorted(plane[faces], self.planes), faces.size)
+        corners = self.city.corners[faces] + self.city.origin
+        if not faces.size:
+            return faces, first, np.zeros((2, 0, 3))
+        bounds = [
+            of.reduceat(of.reduce(corners, axis=1), first[:-1]) for of in (np.minimum, np.maximum)
+        ]
+        return faces, first, np.array(bounds)
+
+    def near(self, own: Pose, reach: float) -> np.ndarray:
+        """Numbers of the mirrors of which something may lie within reach [m] and in front."""
+        low, high = self.boxes
+        p, forward = own.position, own.rotation[:, 1]
+        ahead = np.where(forward > 0, high - p, low - p) @ forward
+        some = self.about(p, reach)
+        return some[ahead[some] > 0]
+
+    def about(self, place: np.ndarray, reach: float) -> np.ndarray:
+        """Numbers of the mirrors of which something may lie within reach [m] of a place."""
+        low, high = self.boxes
+        away = np.maximum(np.maximum(low - place, place - high), 0.0)
+        return np.flatnonzero((away**2).sum(axis=1) < reach**2)
+
+    def within(self, place: np.ndarray, reach: float) -> bool:
+        """Whether a face of a mirror lies within reach [m] of a place (3,); none does within less
+        than nothing."""
+        if reach <= 0:
+            return False
+        near = self.about(place, reach)
+        _, normals, offsets = self.mirrors
+        off = normals[near] @ place - offsets[near]
+        near, off = near[np.abs(off) < reach], off[np.abs(off) < reach]
+        feet = place - off[:, None] * normals[near]
+        return bool(self.holds(near, feet, reach).any())
+
+    def bounded(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
+        """Whether points (n, 3) lie in the box about a mirror's faces, or within `edge` of it."""
+        low, high = self.boxes
+        return ((points >= low[mirrors] - edge) & (points <= high[mirrors] + edge)).all(axis=1)
+
+    @property
+    def boxes(self) -> np.ndarray:
+        """(2, W, 3) lowest and highest corner of each mirror's faces, world coordinates."""
+        return self._faces[2]
+
+    def holds(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
+        """Whether points (n, 3) in the planes of mirrors (n,) lie on one of their faces, or within
+        `edge` of it."""
+        out: np.ndarray = held(mirrors, points - self.city.origin, *self._sides, edge)
+        return out
+
+    @cached_property
+    def _sides(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the mirrors' faces one after the other the corners (n, 3, 3), and what points from the
+        side behind each to the inside, as long as the side; where each mirror's begin."""
+        faces, first, _ = self._faces
+        corners = self.city.corners[faces]
+        along = np.roll(corners, -1, axis=1) - corners
+        return corners, np.cross(self.city.normals[faces][:, None], along), first
+
+    def blocking(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Faces (n,) that the open segment between two points (3,) crosses."""
+        a, b, c = np.moveaxis(self.city.corners, 1, 0)
+        start, span = start - self.city.origin, end - start
+        normal = np.cross(b - a, c - a)
+        slope = normal @ span
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = (normal * (a - start)).sum(1) / slope
+            point = start + share[:, None] * span
+            inside = [
+                (np.cross(q - p, point - p) * normal).sum(1) >= 0
+                for p, q in ((a, b), (b, c), (c, a))
+            ]
+        return np.flatnonzero(
+            (slope != 0) & (share > 0) & (share < 1) & np.logical_and.reduce(inside)
+        )
+
+
+@jit
+def held(
+    mirrors: np.ndarray,
+    points: np.ndarray,
+    corners: np.ndarray,
+    inward: np.ndarray,
+    first: np.ndarray,
+    edge: float,
+) -> np.ndarray:
+    """`Walls.holds`."""
+    out = np.zeros(mirrors.size, np.bool_)
+    for i in range(mirrors.size):
+        for face in range(first[mirrors[i]], first[mirrors[i] + 1]):
+            inside = 0
+            for k in range(3):
+                n, a = inward[face, k], corners[face, k]
+                height = 0.0
+                for c in range(3):
+                    height += n[c] * (points[i, c] - a[c])
+                inside += height >= -edge * np.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
+            if inside == 3:
+                out[i] = True
+                break
+    return out
