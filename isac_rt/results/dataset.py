@@ -19,7 +19,7 @@ from isac_rt.propagation.pathset import PathSet
 from isac_rt.results.losses import LOSSES
 from isac_rt.results.metrics import SymbolCount
 from isac_rt.results.records import KINDS, FrameRecord, ObserverRecord, PictureRecord, Use
-from isac_rt.results.spool import Table
+from isac_rt.results.rows import Table
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,8 +22,8 @@ from isac_rt.results.dataset import (
 from isac_rt.results.metrics import SymbolCount, decibels
 from isac_rt.results.provenance import versions_in_use
 from isac_rt.results.records import KINDS, FrameRecord, LateRecord
+from isac_rt.results.rows import Table
 from isac_rt.results.sensing import Sensing, latencies, summary_block
-from isac_rt.results.spool import Spool, Table
 from isac_rt.results.swarm import summary_of
 from isac_rt.scenario.tree import Scenario
 
@@ -94,13 +93,11 @@ class Figures:
 
 @dataclass
 class Recorder:
-    """Collects the frames of a run as rows of numbers, which lie on the disk meanwhile. An observer
-    is a link's receiver; `states` are the names of the terminals' state codes; `folder` says whose
-    disk it is, None: that of the system's temporary files."""
+    """Collects the frames of a run as rows of numbers. An observer is a link's receiver; `states`
+    are the names of the terminals' state codes."""
 
     timetable: Timetable
     states: Sequence[str]
-    folder: Path | None = None
     tables: dict[str, dict[str, Table]] = field(init=False)
     shots: dict[int, Row] = field(default_factory=dict)
     """Path ledgers and maps of the snapshots by frame."""
@@ -108,7 +105,7 @@ class Recorder:
     """Frames whose rows have changed since they were last kept for a later call."""
 
     def __post_init__(self) -> None:
-        self._num_uavs, self._spool = len(self.timetable.first_roles), Spool(self.folder)
+        self._num_uavs = len(self.timetable.first_roles)
         self.tables = {kind: {} for kind in TABLES}
         self._count = 0
         self._begin("frame", [""])
@@ -122,7 +119,7 @@ class Recorder:
     def _begin(self, kind: str, labels: Iterable[str]) -> None:
         dtype = row_type(kind, self._num_uavs)
         for label in labels:
-            self.tables[kind][label] = Table(dtype, self._spool, self._count)
+            self.tables[kind][label] = Table(dtype, self._count)
 
     def add(self, record: FrameRecord) -> None:
         """Append the next frame."""

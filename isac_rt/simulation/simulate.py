@@ -12,7 +12,6 @@ from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -263,14 +262,12 @@ class _Listeners:
         setup: Setup,
         terminal: Callable[[Link], Terminal],
         receivers: Receivers,
-        folder: Path | None = None,
     ) -> _Listeners:
-        """Before the first frame; `receivers` are the settings that the terminals have, `folder`
-        is where the recorder keeps frames."""
+        """Before the first frame; `receivers` are the settings that the terminals have."""
         links = setup.timetable.all_links
         return cls(
             {link: _Observer(setup, link, terminal(link), receivers) for link in links},
-            Recorder(setup.timetable, [state.name.lower() for state in TerminalState], folder),
+            Recorder(setup.timetable, [state.name.lower() for state in TerminalState]),
             None if setup.scenario.cooperation == "none" else _Swarm(setup),
         )
 
@@ -368,7 +365,7 @@ def run(
     >>> results.summary["terminals"]["PT1"]["ser_delay"]
     0.0
     """
-    run = _Run.begin(scenario, setup, snapshots, terminal, resume.file.parent if resume else None)
+    run = _Run.begin(scenario, setup, snapshots, terminal)
     run.fly(progress, threads, resume)
     summary = run.summary()
     materials = {m.name: vars(m) for m in run.setup.city.materials}
@@ -535,7 +532,6 @@ class _Run:
         setup: Setup | None,
         snapshots: int,
         terminal: Callable[[Setup, Link], Terminal | Receiver],
-        folder: Path | None = None,
     ) -> _Run:
         """Before the first frame."""
         s, stopwatch = setup or prepare(scenario), Stopwatch()
@@ -545,14 +541,12 @@ class _Run:
             return terminal_with(s, link, terminal(s, link))
 
         compared = {
-            name: _Listeners.of(
-                s, partial(standard_terminal, s, settings=one), one.receivers, folder
-            )
+            name: _Listeners.of(s, partial(standard_terminal, s, settings=one), one.receivers)
             for name, one in scenario.compare.items()
         }
         return cls(
             s,
-            _Listeners.of(s, own, scenario.receivers, folder),
+            _Listeners.of(s, own, scenario.receivers),
             compared,
             Schedules(s.schedule, s.antennas.num_tx, scenario.array.fall_back),
             s.timetable.snapshots(snapshots),

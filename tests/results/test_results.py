@@ -76,7 +76,7 @@ def _same(a: xr.Dataset, b: xr.Dataset) -> None:
 
 @pytest.mark.parametrize("detections", [3, 0])
 def test_round_trip_is_bit_exact(tmp_path, detections):
-    """Exact. Seen to fail with float32 in `netcdf._variable`; 0 detections is the empty
+    """Exact. Seen to fail with float32 in `write_dataset`; 0 detections is the empty
     ragged dimension."""
     made = fake_run(detections=detections)
     save(made, tmp_path / "a" / "b")
