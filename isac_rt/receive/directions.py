@@ -143,15 +143,12 @@ class Search:
 
     def lines(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Spectra of the lines along X and Z (S, T, lines, G) of channels (S, T, L)."""
-        out = []
+        out, each = [], y.reshape(-1, y.shape[2])
         for lines in (self.along_x, self.along_z):
-            made = [
-                y[..., members] @ spectra.T
-                for members, spectra in zip(lines.members, lines.spectra, strict=True)
-            ]
-            shape = *y.shape[:2], len(made), DIRECTIONS
-            stacked = np.stack(made, axis=2) if made else np.zeros(shape)
-            out.append(np.ascontiguousarray(stacked, np.complex64))
+            made = np.empty((len(each), len(lines.members), DIRECTIONS), np.complex64)
+            for k, (members, spectra) in enumerate(zip(lines.members, lines.spectra, strict=True)):
+                made[:, k] = each[:, members] @ spectra.T
+            out.append(made.reshape(*y.shape[:2], *made.shape[1:]))
         return out[0], out[1]
 
 
@@ -221,17 +218,12 @@ def search_plain(x: np.ndarray, search: Search, noise: float, least: float) -> F
         for members, spectra in zip(lines.members, lines.spectra, strict=True):
             bound += np.sqrt(line_bounds(flat, looks + members, spectra))
     cell = np.flatnonzero(bound**2 * raised >= least)
-    y = np.ascontiguousarray(x[:, :, cell].transpose(2, 0, 1))
-    peak, cosines = bound[cell] ** 2 * raised, np.full((cell.size, 2), np.nan)
+    x, bound = np.take(x, cell, axis=2), bound[cell]
     if max(len(lines.members) for lines in (search.along_x, search.along_z)) > 1:
-        # of each line the best direction before, of all lines along an axis one here
-        amplitudes = [
-            np.sqrt((f.real**2 + f.imag**2).sum(axis=1)).sum(axis=1).max(axis=1)
-            for f in search.lines(y)
-        ]
-        peak = (amplitudes[0] + amplitudes[1]) ** 2 * raised
+        bound = _axis_bound(x, search)
+    peak, cosines = bound**2 * raised, np.full((cell.size, 2), np.nan)
     some = np.flatnonzero(peak >= least)
-    y = y[some]
+    y = np.ascontiguousarray(x[:, :, some].transpose(2, 0, 1))
     whole = np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32)
     peak[some], cosines[some] = _on_grid(y, whole, search)
     above = peak[some] >= least
@@ -239,6 +231,19 @@ def search_plain(x: np.ndarray, search: Search, noise: float, least: float) -> F
     statistic = statistic_of(y[above], scale=scale)
     peak[some], cosines[some] = climbed(statistic, cosines[some], search)
     return Found(cell, peak, cosines)
+
+
+def _axis_bound(x: np.ndarray, search: Search) -> np.ndarray:
+    """(S,) amplitudes of channels (T, L, S) in the best direction of all lines along X, and of all
+    along Z; `line_bounds` lets each line have its own."""
+    out = np.zeros(x.shape[2], np.float32)
+    for lines in (search.along_x, search.along_z):
+        total = np.zeros((DIRECTIONS, x.shape[2]), np.float32)
+        for members, spectra in zip(lines.members, lines.spectra, strict=True):
+            beams = [spectra @ look[members] for look in x]
+            total += np.sqrt(sum(beam.real**2 + beam.imag**2 for beam in beams))
+        out += total.max(axis=0)
+    return out
 
 
 def search_white(
