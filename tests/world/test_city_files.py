@@ -19,6 +19,7 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 import trimesh
 from trimesh.exchange.ply import load_ply
@@ -31,6 +32,7 @@ from isac_rt.sweep import load_sweep
 from isac_rt.world.area import city_about, city_digest
 from isac_rt.world.city import CityError, city_files, load_city, meshfiles
 from isac_rt.world.city.materials import MAX_MATERIALS
+from isac_rt.world.city.place import crs_name
 
 SECONDS = 8.0
 """For any file of these tests on a loaded machine; each takes well below one."""
@@ -538,6 +540,26 @@ def test_hostile_meshes_end_in_one_message(name, traps):
 def test_hostile_scenes_end_in_one_message(name, traps):
     (traps / "scene.xml").write_text(XML[name])
     assert complaint(traps, "mitsuba", "scene.xml")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "+init={}:1",
+        "+type=crs +init={}:1",
+        "+proj=utm +zone=32 +datum=WGS84 +nadgrids={} +type=crs",
+        "+proj=tmerc +ellps=GRS80 +geoidgrids={} +type=crs",
+        "+proj=utm +zone=32 +datum=WGS84 " + 100_000 * " ",
+    ],
+)
+def test_a_reference_system_opens_no_file(text, tmp_path):
+    """PROJ reads the definition that stands in the file. Planted bug: any text that pyproj
+    takes."""
+    (tmp_path / "own").write_text("<1> +proj=utm +zone=32 +datum=WGS84 +units=m <>\n")
+    assert crs_name(text.format(tmp_path / "own")) is None
+    assert crs_name("+proj=utm +zone=32 +datum=WGS84 +type=crs") is not None
+    assert crs_name(pyproj.CRS("EPSG:25832").to_wkt()) == "EPSG:25832"
+    assert crs_name(pyproj.CRS("EPSG:25832").to_json()) == "EPSG:25832"
 
 
 def test_a_scene_that_windows_wrote_names_its_files(tmp_path):

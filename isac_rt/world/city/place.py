@@ -20,6 +20,10 @@ LONLAT = "OGC:CRS84"
 LARGEST_SCALE_ERROR = 0.005
 """Of a grid whose units are taken for metres: national grids and UTM stay below 0.001, Web Mercator
 is off by 1/cos(latitude)."""
+MAX_CRS_TEXT = 100_000
+"""Letters of a coordinate reference system."""
+_OF_FILES = re.compile(r"init\s*=|grids\s*=|parameter_?file|^\s*\{.*\\", re.IGNORECASE | re.DOTALL)
+"""What makes PROJ open a file that the text names; backslashes of JSON could hide it."""
 _AUTHORITY = re.compile(
     r"(EPSG|ESRI|IGNF|OGC(?=[:/](?:[\d.]*[:/])?CRS))[:/](?:[\d.]*[:/])?(\w{1,20})", re.IGNORECASE
 )
@@ -139,6 +143,8 @@ def crs_name(text: str) -> str | None:
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
+    if len(text) > MAX_CRS_TEXT or _OF_FILES.search(text):
+        return None
     found = _AUTHORITY.search(text[:2000])
     try:
         crs: Any = CRS.from_user_input(f"{found[1]}:{found[2]}" if found else text)
