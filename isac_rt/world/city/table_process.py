@@ -49,6 +49,15 @@ def _limit(kind: int, value: int) -> None:
     resource.setrlimit(kind, (value, value))
 
 
+def _taken() -> int:
+    """Memory that this process has asked for. [bytes]"""
+    try:
+        with open("/proc/self/status") as status:
+            return next(1024 * int(line.split()[1]) for line in status if line[:7] == "VmData:")
+    except (OSError, StopIteration):
+        return 0
+
+
 def _source(files: list[tuple[str, bytes]]) -> bytes:
     """The table as one piece of memory: a Shapefile is several files, which GDAL reads as a zip."""
     if len(files) == 1 and not files[0][0].endswith(".shp"):
@@ -140,7 +149,7 @@ def main() -> None:
     try:
         # what this takes of memory and time does not count
         importlib.import_module("geopandas" if driver == "Parquet" else "pyogrio.raw")
-        _limit(resource.RLIMIT_DATA, memory)
+        _limit(resource.RLIMIT_DATA, _taken() + memory)
         _limit(resource.RLIMIT_CPU, int(time.process_time()) + seconds)
         data = _source(files)
         found = _by_arrow(data) if driver == "Parquet" else _by_gdal(driver, data, request["layer"])

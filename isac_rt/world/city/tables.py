@@ -25,31 +25,32 @@ from isac_rt.world.city.materials import CityError
 
 
 class Table(NamedTuple):
-    """A kind of table: its name, how such a file begins, and the only driver that may read it."""
+    """A kind of table: its name, how such a file begins, the only driver that may read it, and the
+    memory that this may take over the size of the file."""
 
     kind: str
     start: bytes
     driver: str
+    factor: float = 12.0
 
 
 TABLES = {
     ".gpkg": Table("GeoPackage", b"SQLite format 3\0", "GPKG"),
     ".shp": Table("Shapefile", b"\0\0\x27\x0a", "ESRI Shapefile"),
     ".fgb": Table("FlatGeobuf", b"fgb", "FlatGeobuf"),
-    ".parquet": Table("GeoParquet", b"PAR1", "Parquet"),
-    ".geoparquet": Table("GeoParquet", b"PAR1", "Parquet"),
+    ".parquet": Table("GeoParquet", b"PAR1", "Parquet", 40.0),
+    ".geoparquet": Table("GeoParquet", b"PAR1", "Parquet", 40.0),
     ".osm": Table("OpenStreetMap XML", b"<", "OSM"),
-    ".pbf": Table("OpenStreetMap PBF", b"\0\0\0", "OSM"),
+    ".pbf": Table("OpenStreetMap PBF", b"\0\0\0", "OSM", 60.0),
 }
 """What each ending stands for."""
 _BESIDE = (".shx", ".dbf", ".prj", ".cpg")
-PBF_FACTOR = 60
-"""Memory over the size of a PBF file."""
-_FACTOR = 12
 _BASE_BYTES, _BASE_S = 500_000_000, 1
 """Memory and processor time of the process that reads a table, without the table."""
-_BYTES_PER_S = 1e6
-"""Of a table: a tenth of what GDAL reads on one core."""
+_BYTES_PER_S = 12e6
+"""Of memory over the file: a fifth of what is read on one core."""
+_ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "ARROW_IO_THREADS": "1"}
+"""Threads of the process that reads a table: each would take memory of its own."""
 _ROOT = re.compile(rb"\s*(<\?xml[^>]*>\s*)?(<!--.*?-->\s*)*<osm[\s>/]", re.DOTALL)
 """How OpenStreetMap's XML begins."""
 
@@ -71,13 +72,12 @@ def read_table(path: Path, layer: str | None, notes: list[str]) -> tuple[list[Fe
     CityError  If the file is not what its name says, or the readers are not installed.
     """
     table = TABLES[path.suffix.lower()]
-    factor = PBF_FACTOR if path.suffix.lower() == ".pbf" else _FACTOR
-    files = [(file.name, read_bytes(file, factor)) for file in table_files(path)]
+    files = [(file.name, read_bytes(file, table.factor)) for file in table_files(path)]
     _check_start(path.name, table, files[0][1])
     for package in ("pyogrio", "geopandas"):
         if find_spec(package) is None:
             raise missing_extra(path.name, table.kind)
-    found, shapes = _read_apart(table, files, factor, layer)
+    found, shapes = _read_apart(table, files, layer)
     if "refused" in found:
         raise CityError(f"{path.name}: {found['refused']}")
     if "problem" in found:
@@ -101,12 +101,12 @@ def _check_start(name: str, table: Table, data: bytes) -> None:
 
 
 def _read_apart(
-    table: Table, files: Sequence[tuple[str, bytes]], factor: float, layer: str | None
+    table: Table, files: Sequence[tuple[str, bytes]], layer: str | None
 ) -> tuple[dict[str, Any], list[bytes]]:
     """What `table_process` answers: its line, and each row's shape as well-known binary."""
     size = sum(len(content) for _, content in files)
-    seconds = _BASE_S + math.ceil(size * factor / _FACTOR / _BYTES_PER_S)
-    memory = _BASE_BYTES + int(size * factor)
+    seconds = _BASE_S + math.ceil(size * table.factor / _BYTES_PER_S)
+    memory = _BASE_BYTES + int(size * table.factor)
     packages = json.dumps([place for place in sys.path if os.path.isabs(place)])
     program = [str(Path(__file__).with_name("table_process.py")), packages]
     # files of the working folder are not this process's, nor are settings for Python
@@ -118,6 +118,7 @@ def _read_apart(
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             cwd="/",
+            env=os.environ | _ALONE,
             timeout=10 * seconds,
         )
     except subprocess.TimeoutExpired:
