@@ -155,6 +155,7 @@ def test_openstreetmap(name, tmp_path):
         ("town.osm", b"<!--" + b"x" * 6000 + b"--><!DOCTYPE osm []><osm/>", "document type"),
         ("town.osm", "<!DOCTYPE osm []><osm/>".encode("utf-16-le"), "document type"),
         ("town.osm", b"<osm version='0.6'><node id='1'", None),
+        ("town.osm", b"<!-- -->" * 200_000, "begins with <osm>"),
         ("town.pbf", bytes(20), None),
         ("town.gml", b"<?xml version='1.0'?><CityModel/>", "citygml-tools to-cityjson town.gml"),
     ],

@@ -51,7 +51,7 @@ _BYTES_PER_S = 12e6
 """Of memory over the file: a fifth of what is read on one core."""
 _ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "ARROW_IO_THREADS": "1"}
 """Threads of the process that reads a table: each would take memory of its own."""
-_ROOT = re.compile(rb"\s*(<\?xml[^>]*>\s*)?(<!--.*?-->\s*)*<osm[\s>/]", re.DOTALL)
+_ROOT = re.compile(rb"\s*+(?:<\?xml[^>]*>\s*+)?(?:(?><!--.*?-->)\s*+)*+<osm[\s>/]", re.DOTALL)
 """How OpenStreetMap's XML begins."""
 
 
