@@ -8,22 +8,14 @@ from isac_rt.kernels.jit import jit
 from isac_rt.kernels.vector import LANES, load, splat, store
 
 
-def inverses(matrices: np.ndarray) -> np.ndarray:
-    """(S, L, L) complex64, the inverses of Hermitian positive definite matrices (S, L, L).
+@jit(fast=True)
+def inverses(matrices, out):
+    """`isac_rt.receive.directions.fill_inverses`.
 
     Every row is swept once (J. Goodnight, "A tutorial on the SWEEP operator", Am. Stat. 33, 1979),
-    in float64 and without a search for pivots: noise of unit power holds those of a covariance at
-    one and more. Only what lies on and below the diagonal is read.
+    in float64 and without a search for pivots. `table` holds the lower halves of sixteen matrices,
+    real and imaginary parts.
     """
-    matrices = np.ascontiguousarray(matrices, np.complex64)
-    out = np.empty_like(matrices)
-    _inverses(matrices, out)
-    return out
-
-
-@jit(fast=True)
-def _inverses(matrices, out):
-    """`inverses`; `table` holds the lower halves of sixteen of them, real and imaginary parts."""
     size, pair = matrices.shape[1], 2 * LANES
     table = np.zeros(size * (size + 1) // 2 * pair)
     column, one, zero = np.empty(size * pair), np.empty(LANES), splat(np.float64(0))

@@ -45,6 +45,11 @@ REFINERS: dict[str, Refiner | None] = {"grid": None, "local": None, "joint": ref
 READERS = {"powers": ByPowers, "beams": ByBeams}
 
 
+DETECTORS: dict[str, Callable[[Receivers, Estimator], Detector]] = {"angle_doppler": AngleDoppler}
+PASSIVE_DETECTORS: dict[str, Callable[[Receivers, Estimator], Cfar]] = {"beams": BeamSearch}
+"""Detectors by `clutter_detector` and by `passive_detector`, beside the CFAR."""
+
+
 def filter_of(settings: Receivers) -> ClutterFilter | None:
     """The clutter filter that the settings name."""
     return FILTERS[settings.clutter_filter](settings)
@@ -57,16 +62,16 @@ def cfar_of(settings: Receivers) -> Cfar:
 
 def passive_detector_of(settings: Receivers) -> Cfar:
     """The passive terminal's detector."""
-    if settings.passive_detector == "beams":
-        return BeamSearch(settings, ESTIMATORS[settings.refinement])
-    return cfar_of(settings)
+    if settings.passive_detector == "cfar":
+        return cfar_of(settings)
+    return PASSIVE_DETECTORS[settings.passive_detector](settings, ESTIMATORS[settings.refinement])
 
 
 def detector_of(settings: Receivers) -> Detector:
     """The active terminal's detector."""
-    if settings.clutter_detector == "angle_doppler":
-        return AngleDoppler(settings, ESTIMATORS[settings.refinement])
-    return cfar_of(settings)
+    if settings.clutter_detector == "cfar":
+        return cfar_of(settings)
+    return DETECTORS[settings.clutter_detector](settings, ESTIMATORS[settings.refinement])
 
 
 def refiner_of(settings: Receivers) -> Refiner | None:

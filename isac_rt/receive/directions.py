@@ -27,8 +27,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.kernels import receive_directions
-from isac_rt.kernels.hermitian import inverses
+from isac_rt.kernels import hermitian, receive_directions
 from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.receive_directions import Axis
 from isac_rt.kernels.vector import LANES
@@ -342,6 +341,21 @@ def fill_line_bounds(
     """
     beams = spectra @ maps.view(np.complex64)[channels]
     out[:] = (beams.real**2 + beams.imag**2).sum(axis=0).max(axis=0)
+
+
+def inverses(matrices: np.ndarray) -> np.ndarray:
+    """(S, L, L) complex64, the inverses of Hermitian positive definite matrices (S, L, L)."""
+    matrices = np.ascontiguousarray(matrices, np.complex64)
+    out = np.empty_like(matrices)
+    fill_inverses(matrices, out)
+    return out
+
+
+@twin_of(hermitian.inverses)
+def fill_inverses(matrices: np.ndarray, out: np.ndarray) -> None:
+    """Fill the inverses of Hermitian matrices (S, L, L) complex64, whose eigenvalues are one and
+    more, as noise of unit power has it."""
+    out[:] = np.linalg.inv(matrices.astype(complex))
 
 
 def denominators(matrix: np.ndarray, search: Search) -> np.ndarray:

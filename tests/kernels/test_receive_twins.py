@@ -291,3 +291,15 @@ def test_sums_of_samples_against_tones():
     twin(*args[:-1], by_twin)
     most = np.abs(by_twin).max(axis=(3, 4), keepdims=True)
     assert (np.abs(by_kernel - by_twin) <= 1e-5 * most).all()  # taps in float32
+
+
+@pytest.mark.parametrize(("count", "size"), [(1, 1), (16, 5), (37, 15), (3, 45)])
+def test_inverses(count: int, size: int):
+    """Clutter 50 dB over noise of unit power, so that the inverse's elements are one at most.
+    Planted bugs in the kernel: sums in float32 (3e-4); the last matrices, which fill no vector,
+    left out; the upper half not conjugated."""
+    rng = np.random.default_rng(5)
+    waves = rng.standard_normal((count, size, 3, 2)) @ [1, 1j]
+    R = (np.eye(size) + 1e5 * waves @ waves.conj().transpose(0, 2, 1)).astype(np.complex64)
+    name = "isac_rt.receive.directions.fill_inverses"
+    assert_twins_agree(name, R, np.zeros_like(R), rtol=0, atol=1e-6)

@@ -29,8 +29,15 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from scipy import ndimage
 
 from isac_rt.receive.arms import Channels
+from isac_rt.receive.cfar import CfarRule, strong_lobes
+from isac_rt.receive.settings import Receivers
+
+LEAST_CLUTTER = 0.03
+"""Cells whose expected clutter is less than this share of the noise are taken to hold noise
+alone."""
 
 
 def scanned(
@@ -87,3 +94,17 @@ def threshold_of(sizes: tuple[tuple[tuple[float, ...], float], ...], rate: float
     if rate >= tail[trusted]:
         return float(np.interp(-np.log(rate), -np.log(tail[: trusted + 1]), grid[: trusted + 1]))
     return float(grid[trusted] + np.log(tail[trusted] / rate))
+
+
+def unexplained(
+    power: np.ndarray,
+    target: np.ndarray,
+    settings: Receivers,
+    left_out: np.ndarray | bool = False,
+) -> np.ndarray:
+    """Return how many times the expected power (rows, P) is found around each cell, once at least:
+    the greater of both sides in range, so that what the mesh does not know raises the threshold.
+    Cells about a `target`, and those `left_out`, do not count."""
+    near = ndimage.binary_dilation(target, np.ones((3, 3), bool)) | left_out
+    rule = CfarRule.of(settings, 1)
+    return np.maximum(rule.background(power, ~(near | strong_lobes(power))), 1.0)

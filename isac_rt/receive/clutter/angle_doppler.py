@@ -12,19 +12,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage
 
-from isac_rt.kernels.hermitian import inverses
 from isac_rt.receive.arms import all_channels, both_arms
 from isac_rt.receive.cfar import (
     LOBE_MARGIN,
-    CfarRule,
     first_row,
     leaked,
-    strong_lobes,
     strongest_peaks,
 )
-from isac_rt.receive.clutter.adaptive import scanned, threshold_of
+from isac_rt.receive.clutter.adaptive import LEAST_CLUTTER, scanned, threshold_of, unexplained
 from isac_rt.receive.clutter.correction import fit
 from isac_rt.receive.clutter.covariance import Bucketed
 from isac_rt.receive.clutter.gates import Gate, gates_of, seek
@@ -36,6 +32,7 @@ from isac_rt.receive.directions import (
     Found,
     Search,
     climbed,
+    inverses,
     search_plain,
     search_white,
     searches,
@@ -48,9 +45,6 @@ from isac_rt.receive.sense import Sensed, describe
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import NO_HINTS, Correction, ExpectedClutter, Gates, Hints
 
-LEAST = 0.03
-"""Cells whose expected clutter is less than this share of the noise are taken to hold noise
-alone."""
 QUIET = 0.3
 """Share of the cells, those with the least clutter to be expected, whose median power is taken for
 the noise's."""
@@ -197,7 +191,7 @@ class AngleDoppler:
             cosines[found.cell] = found.cosines
 
         note(plain, limits[0])
-        filled = np.fft.ifftshift(expected, axes=1).ravel() > LEAST * noise
+        filled = np.fft.ifftshift(expected, axes=1).ravel() > LEAST_CLUTTER * noise
         cell = plain.cell[filled[plain.cell] & (plain.peak > PRUNED * limits[1][0])]
         bucketed = Bucketed.of(hints.clutter, known, everything, noise, self.taper)
 
@@ -226,7 +220,7 @@ class AngleDoppler:
             np.fft.fftshift(a.reshape(rows, bins, *a.shape[1:]), axes=1)
             for a in (ratio, sure, cosines)
         ]
-        held_up = self._unexplained(power / (noise + expected), shown[0])
+        held_up = unexplained(power / (noise + expected), shown[0] > 1, self.settings)
         half = bins // 2
         whiteners = {(c // bins, (c % bins + half) % bins): one for c, one in inverse.items()}
         passed = shown[0] / held_up, shown[1] / held_up
@@ -237,13 +231,6 @@ class AngleDoppler:
         size = scanned(search.channels, known.wavenumber, known.antennas.view_limit)
         usual, sure = self.settings.false_alarm_rates
         return threshold_of((size,), usual), threshold_of((size,), sure)
-
-    def _unexplained(self, found: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-        """How many times the power around a cell is what was expected, once at least: the greater
-        of both sides in range, so that what the mesh does not know raises the threshold."""
-        target = ndimage.binary_dilation(ratio > 1, np.ones((3, 3), bool))
-        rule = CfarRule.of(self.settings, 1)
-        return np.maximum(rule.background(found, ~(target | strong_lobes(found))), 1.0)
 
 
 def _gates(

@@ -22,17 +22,15 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy import ndimage, optimize, special
+from scipy import optimize, special
 
 from isac_rt.receive.cfar import (
     LOBE_MARGIN,
-    CfarRule,
     first_row,
     hann_envelope,
-    strong_lobes,
     strongest_peaks,
 )
-from isac_rt.receive.clutter.adaptive import scanned
+from isac_rt.receive.clutter.adaptive import LEAST_CLUTTER, scanned, unexplained
 from isac_rt.receive.clutter.angle_doppler import noise_level
 from isac_rt.receive.clutter.covariance import Bucketed
 from isac_rt.receive.clutter.power import TAPER, expected_power
@@ -53,9 +51,6 @@ from isac_rt.receive.pursuit import LEFT_OVER_DB, BySchedule, take_strong
 from isac_rt.receive.sense import Sensed, describe
 from isac_rt.receive.types import NO_HINTS, Detections, ExpectedClutter, Hints
 
-LEAST = 0.03
-"""Cells whose expected clutter is less than this share of the noise are taken to hold noise
-alone."""
 BESIDE = (3, 1)
 """Rows and bins about a path that was taken out which may hold its remainder, `LEFT_OVER_DB` below
 it."""
@@ -79,26 +74,27 @@ class BeamSearch(BySchedule):
         left_over = Remainder.of(strong, snr, known, rest.shape)
         noise, expected = self._noise(rest, known, clutter)
         ratio, sure, cosines = self._judge(maps, noise, expected, known, clutter, left_over)
-        held_up = self._unexplained(rest / (noise + expected), ratio, left_over.power > 0)
+        found = rest / (noise + expected)
+        held_up = unexplained(found, ratio > 1, self.settings, left_over.power > 0)
         ratio, sure = ratio / held_up, sure / held_up
         ratio[: first_row(self.settings, known.range_cell)] = 0
         rows, bins = strongest_peaks(ratio, ratio > 1, self.settings, UNION_FLOOR)
-        weak, found = [], []
+        weak, estimates = [], []
         for row, column in zip(rows.tolist(), bins.tolist(), strict=True):
             beam = _Beam(left, known, row, cosines[row, column])
             e = self.estimator.at(beam, ratio, row, column)
-            found.append(e)
+            estimates.append(e)
             weak.append(_near(e, known, cosines[row, column]))
         limit = self._limits(receiver_search(known.antennas, known.wavenumber), known)[0]
         detections = _described(
-            found, np.array(weak).reshape(-1, 2), ratio[rows, bins] * limit, known
+            estimates, np.array(weak).reshape(-1, 2), ratio[rows, bins] * limit, known
         )
         first = describe(strong, snr, known)
         if clutter is not None:  # a city's walls are as strong, and no mesh explains all of them
             first = replace(first, starts=np.zeros(len(strong), bool))
         starts = (sure[rows, bins] > 1) & ~_remainders(detections, first, known)
         detections = replace(detections, starts=starts)
-        return Sensed([*strong, *found], Detections.joined([first, detections]), power, level)
+        return Sensed([*strong, *estimates], Detections.joined([first, detections]), power, level)
 
     def _noise(
         self, power: np.ndarray, known: Known, clutter: ExpectedClutter | None
@@ -130,7 +126,7 @@ class BeamSearch(BySchedule):
         ratio[plain.cell], sure[plain.cell] = plain.peak / limit[0], plain.peak / limit[1]
         cosines[plain.cell] = plain.cosines
         held = np.fft.ifftshift(expected / noise + left_over.power, axes=1).ravel()
-        cell = plain.cell[(held[plain.cell] > LEAST) & (plain.peak > least)]
+        cell = plain.cell[(held[plain.cell] > LEAST_CLUTTER) & (plain.peak > least)]
         if cell.size:
             rows, bins = np.divmod(cell, shape[1])
             R = left_over.covariances(rows, bins, search)
@@ -154,12 +150,6 @@ class BeamSearch(BySchedule):
         usual, sure = self.settings.false_alarm_rates
         looks = known.antennas.num_tx
         return field_threshold(*size, looks, usual), field_threshold(*size, looks, sure)
-
-    def _unexplained(self, found: np.ndarray, ratio: np.ndarray, beside: np.ndarray) -> np.ndarray:
-        """How many times the power around a cell is what was expected, once at least."""
-        target = ndimage.binary_dilation(ratio > 1, np.ones((3, 3), bool)) | beside
-        rule = CfarRule.of(self.settings, 1)
-        return np.maximum(rule.background(found, ~(target | strong_lobes(found))), 1.0)
 
 
 @dataclass(frozen=True)

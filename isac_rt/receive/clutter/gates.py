@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from isac_rt.kernels.hermitian import inverses
 from isac_rt.receive.clutter.adaptive import expected_count, scanned_within
-from isac_rt.receive.directions import Found, Search, statistic_of
+from isac_rt.receive.directions import Found, Search, inverses, statistic_of
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import Gates
 
