@@ -13,7 +13,6 @@ from scipy.special import gammaincinv
 
 from isac_rt.frame.schedule import unambiguous_share
 from isac_rt.frame.waveform import Waveform
-from isac_rt.kernels.jit import jit
 from isac_rt.world.swarm import Pose
 
 STD_FLOOR = np.array([1e-3, 1e-2, 2e-4, 2e-4])
@@ -96,70 +95,36 @@ def measure(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None)
     return np.stack([distance, rate, u[..., 0], u[..., 2]], axis=-1)
 
 
-@jit
 def _leg_jacobian(offset: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivative of (length, rate) of one leg with respect to relative position and velocity (2,
-    6), and of its direction with respect to the position, (I - e e^T)/r (3, 3)."""
-    r = np.sqrt(np.sum(offset * offset))
-    e = offset / r
-    turn = (np.eye(3) - np.outer(e, e)) / r
-    leg = np.zeros((2, 6))
-    leg[0, :3], leg[1, 3:] = e, e
-    for i in range(3):
-        leg[1, i] = np.sum(turn[i] * velocity)
+    """Derivative of (length, rate) of one path segment with respect to relative position and
+    velocity (..., 2, 6), and of its direction with respect to the position, (I - e e^T)/r (..., 3,
+    3)."""
+    r, e = _unit(offset)
+    turn = (np.eye(3) - e[..., :, None] * e[..., None, :]) / r[..., None, None]
+    leg = np.zeros((*e.shape[:-1], 2, 6))
+    leg[..., 0, :3] = leg[..., 1, 3:] = e
+    leg[..., 1, :3] = (turn @ velocity[..., None])[..., 0]
     return leg, turn
 
 
-@jit
-def _linearised(
-    state: np.ndarray, own: np.ndarray, transmitter: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """`measure` of one state (4,) and its derivative (4, S); `own`: position, velocity and the
-    columns of the attitude (5, 3), `transmitter`: (0,) or (6 or 9,)."""
-    offset, speed = state[:3] - own[0], state[3:6] - own[1]
-    leg, turn = _leg_jacobian(offset, speed)
-    e = leg[0, :3]
-    z, out = np.empty(4), np.zeros((4, state.size))
-    z[0], z[1] = np.sum(e * offset), np.sum(e * speed)
-    for k in range(2):  # u_x, u_z
-        axis = own[2 + 2 * k]
-        z[2 + k] = np.sum(axis * e)
-        for i in range(3):
-            out[2 + k, i] = np.sum(axis * turn[i])
-    out[:2, :6] = leg
-    if transmitter.size:
-        offset, speed = state[:3] - transmitter[:3], state[3:6] - transmitter[3:6]
-        leg, turn = _leg_jacobian(offset, speed)
-        z[0] += np.sum(leg[0, :3] * offset)
-        z[1] += np.sum(leg[0, :3] * speed)
-        out[:2, :6] += leg
-    return z, out
-
-
-def _terms(own: Pose, transmitter: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """A receiver and what it hears as the compiled functions take them."""
-    mine = np.concatenate([own.position[None], own.velocity[None], own.rotation.T])
-    return mine, np.zeros(0) if transmitter is None else np.ascontiguousarray(transmitter)
-
-
 def jacobian(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None) -> np.ndarray:
-    """Derivative of `measure` with respect to the body's state (S,): (4, S)."""
-    return np.asarray(_linearised(np.ascontiguousarray(state), *_terms(own, transmitter))[1])
-
-
-@jit
-def _transmitter_jacobians(states: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
-    """`transmitter_jacobian` of each state (K, S): (K, 4, S)."""
-    out = np.zeros((len(states), 4, transmitter.size))
-    for k in range(len(states)):
-        offset, speed = states[k, :3] - transmitter[:3], states[k, 3:6] - transmitter[3:6]
-        out[k, :2, :6] = -_leg_jacobian(offset, speed)[0]
+    """Derivative of `measure` with respect to the body's states (..., S): (..., 4, S)."""
+    leg, turn = _leg_jacobian(state[..., :3] - own.position, state[..., 3:6] - own.velocity)
+    out = np.zeros((*state.shape[:-1], 4, state.shape[-1]))
+    out[..., :2, :6] = leg
+    out[..., 2:, :3] = own.rotation.T[[0, 2]] @ turn  # u_x, u_z
+    if transmitter is not None:
+        out[..., :2, :6] -= transmitter_jacobian(state, transmitter)[..., :2, :6]
     return out
 
 
 def transmitter_jacobian(state: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
-    """Derivative of the bistatic `measure` with respect to the transmitter's state (S,): (4, S)."""
-    return np.asarray(_transmitter_jacobians(state[None], transmitter)[0])
+    """Derivative of the bistatic `measure` of bodies (..., 6 or 9) with respect to the
+    transmitter's state (S,): (..., 4, S)."""
+    out = np.zeros((*state.shape[:-1], 4, transmitter.size))
+    offset, speed = state[..., :3] - transmitter[:3], state[..., 3:6] - transmitter[3:6]
+    out[..., :2, :6] = -_leg_jacobian(offset, speed)[0]
+    return out
 
 
 def measurement_covariance(
@@ -213,54 +178,9 @@ def predict(g: Gaussian, interval: float, acceleration_std: float) -> Gaussian:
     """A track after an interval [s] by Singer's model of its acceleration [m/s^2]."""
     if interval == 0:  # the same time again; the powers of the interval in `singer` have no limit
         return g
-    return Gaussian(*_carried(*g, *singer(interval, acceleration_std)))
-
-
-@jit
-def _carried(
-    mean: np.ndarray, P: np.ndarray, F: np.ndarray, Q: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    P = F @ P @ F.T + Q
-    return F @ mean, (P + P.T) / 2
-
-
-@jit
-def _unfold(measured: np.ndarray, off: float, ambiguity: tuple[float, float]) -> None:
-    """Take from range and velocity, in place, the periods in a velocity so far `off`."""
-    if np.isfinite(ambiguity[0]) and np.isfinite(off):
-        periods = np.round(off / ambiguity[0])
-        measured[0] += periods * ambiguity[1]
-        measured[1] -= periods * ambiguity[0]
-
-
-@jit
-def _updated(
-    mean: np.ndarray,
-    P: np.ndarray,
-    measurement: np.ndarray,
-    R: np.ndarray,
-    rows: np.ndarray,
-    own: np.ndarray,
-    transmitter: np.ndarray,
-    ambiguity: tuple[float, float],
-) -> tuple[np.ndarray, np.ndarray]:
-    """`update` by some `rows` of a measurement: mean and covariance."""
-    R = R[rows][:, rows].copy()
-    x, deviation = mean, np.sqrt(np.diag(P))
-    for _ in range(_ITERATIONS):
-        z, full = _linearised(x, own, transmitter)
-        off = measurement - z
-        _unfold(off, off[1], ambiguity)
-        y, H = off[rows], full[rows]
-        K = np.linalg.solve(H @ P @ H.T + R, H @ P).T.copy()
-        new = mean + K @ (y - H @ (mean - x))
-        settled = np.all(np.abs(new - x) <= 1e-3 * deviation)
-        x = new
-        if settled:
-            break
-    A = np.eye(x.size) - K @ H
-    P = A @ P @ A.T + K @ R @ K.T
-    return x, (P + P.T) / 2
+    F, Q = singer(interval, acceleration_std)
+    P = F @ g.covariance @ F.T + Q
+    return Gaussian(F @ g.mean, (P + P.T) / 2)
 
 
 def update(
@@ -280,9 +200,37 @@ def update(
     bends visibly. Joseph form. Of what the `ambiguity` leaves open the reading nearest in velocity
     counts.
     """
-    rows = np.flatnonzero(np.isfinite(measurement))
-    terms = *_terms(own, transmitter), tuple(ambiguity)
-    return Gaussian(*_updated(*g, measurement, R, rows, *terms))
+    return _updated(g, measurement, R, _measured(measurement), own, transmitter, ambiguity)
+
+
+def _measured(measurement: np.ndarray) -> np.ndarray:
+    return np.flatnonzero(np.isfinite(measurement))
+
+
+def _updated(
+    g: Gaussian,
+    measurement: np.ndarray,
+    R: np.ndarray,
+    rows: np.ndarray,
+    own: Pose,
+    transmitter: np.ndarray | None,
+    ambiguity: Ambiguity,
+) -> Gaussian:
+    """`update` by some `rows` of a measurement."""
+    mean, P = g
+    R, x, deviation = R[np.ix_(rows, rows)], mean, np.sqrt(np.diag(P))
+    for _ in range(_ITERATIONS):
+        off = measurement - measure(x, own, transmitter)
+        y, H = wrapped(off, ambiguity)[rows], jacobian(x, own, transmitter)[rows]
+        K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
+        new = mean + K @ (y - H @ (mean - x))
+        settled = np.all(np.abs(new - x) <= 1e-3 * deviation)
+        x = new
+        if settled:
+            break
+    A = np.eye(x.size) - K @ H
+    P = A @ P @ A.T + K @ R @ K.T
+    return Gaussian(x, (P + P.T) / 2)
 
 
 def expected(
@@ -302,8 +250,7 @@ def expected(
     dz = z - z_mean[..., None, :]
     S = np.swapaxes(dz, -1, -2) @ dz / z.shape[-2]
     if transmitter is not None:
-        J = _transmitter_jacobians(mean.reshape(-1, mean.shape[-1]), transmitter.mean)
-        J = J.reshape(*mean.shape[:-1], *J.shape[1:])
+        J = transmitter_jacobian(mean, transmitter.mean)
         S = S + J @ transmitter.covariance @ np.swapaxes(J, -1, -2)
     return z_mean, S
 
@@ -316,29 +263,13 @@ def reported(
     if not states:
         return np.zeros((0, 4)), np.zeros((0, 4))
     means, covariances = (np.array(of) for of in zip(*states, strict=True))
-    terms = _terms(own, None if transmitter is None else transmitter.mean)
-    doubt = np.zeros((0, 0)) if transmitter is None else transmitter.covariance
-    z, variance = _reported(means, covariances, *terms, doubt)
-    return z, np.sqrt(variance)
-
-
-@jit
-def _reported(
-    means: np.ndarray,
-    covariances: np.ndarray,
-    own: np.ndarray,
-    transmitter: np.ndarray,
-    doubt: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """And the variances (K, 4); `doubt` is the transmitter's covariance."""
-    z, variance = np.empty((len(means), 4)), np.empty((len(means), 4))
-    for k in range(len(means)):
-        z[k], H = _linearised(means[k], own, transmitter)
-        variance[k] = np.sum((H @ covariances[k]) * H, axis=1)
-        if transmitter.size:
-            J = _transmitter_jacobians(means[k : k + 1], transmitter)[0]
-            variance[k] += np.sum((J @ doubt) * J, axis=1)
-    return z, variance
+    there = None if transmitter is None else transmitter.mean
+    H = jacobian(means, own, there)
+    variance = ((H @ covariances) * H).sum(axis=-1)
+    if transmitter is not None:
+        J = transmitter_jacobian(means, transmitter.mean)
+        variance += ((J @ transmitter.covariance) * J).sum(axis=-1)
+    return measure(means, own, there), np.sqrt(variance)
 
 
 def wrapped(difference: np.ndarray, ambiguity: Ambiguity) -> np.ndarray:
@@ -354,7 +285,6 @@ def wrapped(difference: np.ndarray, ambiguity: Ambiguity) -> np.ndarray:
     return out
 
 
-@jit
 def bistatic_distance(length: float, baseline: np.ndarray, direction: np.ndarray) -> float:
     """Distance from the receiver to a reflector, rho = (L^2 - d^2) / (2 (L - d.u)) [m].
 
@@ -362,10 +292,11 @@ def bistatic_distance(length: float, baseline: np.ndarray, direction: np.ndarray
     `direction` u (3,) unit to the reflector. Not positive where the length is not longer than the
     baseline.
     """
-    ahead = np.sum(baseline * direction)
-    return (length**2 - np.sum(baseline * baseline)) / (2 * (length - ahead))
+    ahead = baseline @ direction
+    return float((length**2 - baseline @ baseline) / (2 * (length - ahead)))
 
 
+@np.errstate(invalid="ignore")  # in the very place of the transmitter
 def birth(
     measurement: np.ndarray,
     std: np.ndarray,
@@ -387,71 +318,40 @@ def birth(
     u_x, u_z = measurement[2:]
     if not np.isfinite(measurement).all() or u_x**2 + u_z**2 >= 1:
         return None
-    terms = _terms(own, None if transmitter is None else transmitter.mean)
-    doubt = np.zeros((0, 0)) if transmitter is None else transmitter.covariance
-    seen = np.asarray(measurement, float), np.fmax(std, STD_FLOOR)
-    born, mean, covariance = _born(*seen, *terms, doubt, float(acceleration_std), tuple(ambiguity))
-    return Gaussian(mean, covariance) if born else None
-
-
-@jit
-def _born(
-    measurement: np.ndarray,
-    std: np.ndarray,
-    own: np.ndarray,
-    transmitter: np.ndarray,
-    doubt: np.ndarray,
-    acceleration_std: float,
-    ambiguity: tuple[float, float],
-) -> tuple[bool, np.ndarray, np.ndarray]:
-    """`birth`: whether there is one, its mean and covariance; `doubt` is the
-    transmitter's covariance, `own` and `transmitter` are as of `_linearised`."""
-    mean, P = _resting(measurement, own, transmitter), np.zeros((9, 9))
-    if not mean.size:
-        return False, mean, P
-    read = measurement.copy()
-    _unfold(read, measurement[1] - _linearised(mean, own, transmitter)[0][1], ambiguity)
-    mean = _resting(read, own, transmitter)
-    if not mean.size:
-        return False, mean, P
-    rho = np.sqrt(np.sum((mean[:3] - own[0]) ** 2))
-    H, R = _linearised(mean, own, transmitter)[1], np.diag(std**2)
-    if transmitter.size:
-        T = _transmitter_jacobians(mean[None], transmitter)[0]
-        R += T @ doubt @ T.T
-    J, shown = np.zeros((3, 3)), np.zeros((3, 3))
-    for i in range(3):
-        J[i] = H[_POSITION[i], :3]
-        for j in range(3):
-            shown[i, j] = R[_POSITION[i], _POSITION[j]]
+    there = None if transmitter is None else transmitter.mean
+    mean = _resting(measurement, own, there)
+    if mean is None:
+        return None
+    off = measurement - measure(mean, own, there)
+    read = measurement + (wrapped(off, ambiguity) - off)
+    mean = _resting(read, own, there)
+    if mean is None:
+        return None
+    R = measurement_covariance(std, mean, transmitter)
+    J = jacobian(mean, own, there)[_POSITION, :3]
+    rho = float(np.linalg.norm(mean[:3] - own.position))
     if not np.isfinite(J).all():  # in the very place of the transmitter
-        return False, mean, P
+        return None
     if np.linalg.cond(J * np.array([[1.0], [rho], [rho]])) > 1e6:
-        return False, mean, P
+        return None
     back = np.linalg.inv(J)
-    P[:3, :3] = back @ shown @ back.T
-    if np.trace(P) > BIRTH_POSITION_STD_LIMIT**2:
-        return False, mean, P
-    for i in range(3, 6):
-        P[i, i], P[i + 3, i + 3] = BIRTH_SPEED_STD**2, acceleration_std**2
-    P = (P + P.T) / 2
-    rate = np.array([1])
-    return True, *_updated(mean, P, read, R, rate, own, transmitter, (np.inf, 0.0))
+    position = back @ R[np.ix_(_POSITION, _POSITION)] @ back.T
+    if np.trace(position) > BIRTH_POSITION_STD_LIMIT**2:
+        return None
+    P = np.diag([0.0] * 3 + [BIRTH_SPEED_STD**2] * 3 + [acceleration_std**2] * 3)
+    P[:3, :3] = (position + position.T) / 2
+    return _updated(Gaussian(mean, P), read, R, np.array([1]), own, there, UNAMBIGUOUS)
 
 
-@jit
-def _resting(measurement: np.ndarray, own: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
-    """State (9,) of a body at rest where range and direction place it, (0,): nowhere."""
-    u_x, u_z, rho = measurement[2], measurement[3], measurement[0]
-    forward = np.sqrt(max(1 - u_x**2 - u_z**2, 0.0))
-    e = u_x * own[2] + forward * own[3] + u_z * own[4]
-    if transmitter.size:
-        rho = bistatic_distance(rho, transmitter[:3] - own[0], e)
-    if not rho > 0:
-        return np.zeros(0)
-    out = np.zeros(9)
-    out[:3] = own[0] + rho * e
-    return out
+def _resting(
+    measurement: np.ndarray, own: Pose, transmitter: np.ndarray | None
+) -> np.ndarray | None:
+    """State (9,) of a body at rest where range and direction place it; None: nowhere."""
+    rho, _, u_x, u_z = measurement
+    e = own.to_world(np.array([u_x, np.sqrt(max(1 - u_x**2 - u_z**2, 0.0)), u_z]))
+    if transmitter is not None:
+        rho = bistatic_distance(rho, transmitter[:3] - own.position, e)
+    return np.concatenate([own.position + rho * e, np.zeros(6)]) if rho > 0 else None
 
 
 def costs(
@@ -465,59 +365,31 @@ def costs(
     """(K, Q) d^2 + ln det S of detections (Q, 4) with deviations against what is `expected` of K
     tracks, minus twice the log likelihood but for a constant; inf outside the gate in which a
     detection of the track lies with a `probability`. Components that are NaN were not measured."""
-    residual = wrapped(z[None] - mean[:, None], ambiguity)
-    out: np.ndarray = _costs(residual, np.fmax(std, STD_FLOOR) ** 2, S, _gates(probability))
+    y = wrapped(z[None] - mean[:, None], ambiguity)
+    measured = np.isfinite(y)
+    y = np.where(measured, y, 0.0)
+    most = _gates(probability)[measured.sum(axis=-1)]
+    variance = np.fmax(std, STD_FLOOR) ** 2
+    own_variance = S[:, None, range(4), range(4)] + variance
+    k, q = np.nonzero((y**2 <= most[..., None] * own_variance).all(axis=-1))  # no other can be in
+    both = measured[k, q, :, None] & measured[k, q, None, :]
+    A = np.where(both, S[k] + np.eye(4) * variance[q, None], np.eye(4))
+    d2, log_det = mahalanobis(y[k, q], A)
+    out = np.full(y.shape[:2], np.inf)
+    out[k, q] = np.where(d2 <= most[k, q], d2 + log_det, np.inf)
     return out
+
+
+def mahalanobis(y: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """y^T S^-1 y and ln det S of residuals (N, n) with covariances (N, n, n), by Cholesky's
+    factor."""
+    L = np.linalg.cholesky(S)
+    whitened = np.linalg.solve(L, y[..., None])[..., 0]
+    diagonal = np.diagonal(L, axis1=-2, axis2=-1)
+    return (whitened**2).sum(axis=-1), 2 * np.log(diagonal).sum(axis=-1)
 
 
 @lru_cache(maxsize=8)
 def _gates(probability: float) -> np.ndarray:
     """(5,) squared distances by the number of components."""
     return 2 * gammaincinv(np.arange(5) / 2, probability)
-
-
-@jit
-def _costs(
-    residual: np.ndarray, variance: np.ndarray, S: np.ndarray, gates: np.ndarray
-) -> np.ndarray:
-    tracks, detections, _ = residual.shape
-    out, y = np.full((tracks, detections), np.inf), np.empty(4)
-    A, work = np.empty((4, 4)), np.empty((5, 4))
-    for k in range(tracks):
-        for q in range(detections):
-            found = np.flatnonzero(np.isfinite(residual[k, q]))
-            for i in range(found.size):
-                y[i] = residual[k, q, found[i]]
-                for j in range(i + 1):
-                    A[i, j] = S[k, found[i], found[j]]
-                A[i, i] += variance[q, found[i]]
-            d2, log_det = distance(y[: found.size], A, work)
-            if d2 <= gates[found.size]:
-                out[k, q] = d2 + log_det
-    return out
-
-
-@jit
-def distance(y: np.ndarray, S: np.ndarray, work: np.ndarray) -> tuple[float, float]:
-    """y^T S^-1 y and ln det S of a residual (n,) by Cholesky's factor L of the covariance, of which
-    the lower half is read: the square of L^-1 y, and twice the logarithms of L's diagonal. Infinity
-    both where S is no covariance; `work` (n + 1, n)."""
-    d2, log_det, L, w = 0.0, 0.0, work[1:], work[0]
-    for i in range(y.size):
-        for j in range(i + 1):
-            left = S[i, j]
-            for m in range(j):
-                left -= L[i, m] * L[j, m]
-            if j < i:
-                L[i, j] = left / L[j, j]
-            elif left > 0:
-                L[i, i] = np.sqrt(left)
-            else:
-                return np.inf, np.inf
-        left = y[i]
-        for m in range(i):
-            left -= L[i, m] * w[m]
-        w[i] = left / L[i, i]
-        d2 += w[i] ** 2
-        log_det += 2 * np.log(L[i, i])
-    return d2, log_det

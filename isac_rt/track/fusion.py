@@ -17,11 +17,11 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import gammaincinv
 
-from isac_rt.kernels.jit import jit
 from isac_rt.plain import Stateful
-from isac_rt.track.filter import Gaussian, distance, singer
+from isac_rt.track.filter import Gaussian, mahalanobis, singer
 from isac_rt.track.parts import POSE_STD
 from isac_rt.track.tracker import LEAST_APART, TrackSet, assign
 from isac_rt.world.swarm import Pose
@@ -134,28 +134,14 @@ def at_once(reports: Iterable[Report], time: float, acceleration_std: float) -> 
     moved = [_coasting(t, acceleration_std) if t else still for t in intervals]
     each = [(*r.state, r.lever, *of) for r, of in zip(some, moved, strict=True)]
     means, covariances, levers, *model = (np.array(of) for of in zip(*each, strict=True))
-    _bring_on(means, covariances, levers, np.array(intervals), *model)
+    F, Q = model
+    levers[:, :3] += np.array(intervals)[:, None, None] * levers[:, 3:]
+    means = (F @ means[..., None])[..., 0]
+    covariances = F @ covariances @ np.swapaxes(F, 1, 2) + Q
     return [
         Report(r.key, r.since, r.name, time, Gaussian(*state), lever)
         for r, *state, lever in zip(some, means, covariances, levers, strict=True)
     ]
-
-
-@jit
-def _bring_on(
-    means: np.ndarray,
-    covariances: np.ndarray,
-    levers: np.ndarray,
-    intervals: np.ndarray,
-    F: np.ndarray,
-    Q: np.ndarray,
-) -> None:
-    """Bring R reports on by intervals [s] of the models F and Q (R, 6, 6), in place."""
-    for k in range(len(means)):
-        levers[k, :3] += intervals[k] * levers[k, 3:]
-        if intervals[k]:
-            means[k] = F[k] @ means[k]
-            covariances[k] = F[k] @ covariances[k] @ F[k].T + Q[k]
 
 
 @dataclass(frozen=True)
@@ -209,7 +195,6 @@ def in_world(
     return Told(Gaussian(mean, tracks.covariance[row] + np.outer(pulled, pulled)), lever)
 
 
-@jit
 def _levers(
     mean: np.ndarray, baseline: np.ndarray, clock_std: float, cell: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -227,12 +212,10 @@ def _levers(
     return pulled, lever
 
 
-@jit
-def _size(x: np.ndarray) -> float:
-    return np.sqrt(np.sum(x * x))
+def _norm(x: np.ndarray) -> float:
+    return float(np.linalg.norm(x))
 
 
-@jit
 def _by_length(offset: np.ndarray, baseline: np.ndarray, masked: float) -> np.ndarray:
     """What a metre more of path length does to the place of a passive terminal's body (3,).
 
@@ -241,26 +224,25 @@ def _by_length(offset: np.ndarray, baseline: np.ndarray, masked: float) -> np.nd
     """
     if not baseline.size:
         return np.zeros(3)
-    rho = _size(offset)
-    length = rho + _size(offset - baseline)
-    if length - _size(baseline) > masked:
+    rho = _norm(offset)
+    length = rho + _norm(offset - baseline)
+    if length - _norm(baseline) > masked:
         return np.zeros(3)
     u = offset / rho
     # of rho = (L^2 - d^2) / (2 (L - d.u)) by L; on the line of sight L = d.u
-    room = max(length - np.sum(baseline * u), (length - rho) / MOST_PULLED, SAME_M)
+    room = max(length - float(baseline @ u), (length - rho) / MOST_PULLED, SAME_M)
     return u * (length - rho) / room
 
 
-@jit
 def _by_clock(offset: np.ndarray, baseline: np.ndarray) -> np.ndarray:
     """How far a body moves for each metre that a terminal's clock adds to its ranges (3,): along
     its direction, by its path length and its reference's, which are both too long."""
-    rho = _size(offset)
+    rho = _norm(offset)
     u = offset / rho
     if not baseline.size:
         return u
-    d = _size(baseline)
-    length, ahead = rho + _size(offset - baseline), np.sum(baseline * u)
+    d = _norm(baseline)
+    length, ahead = rho + _norm(offset - baseline), baseline @ u
     if length - ahead < SAME_M:  # on the line of sight
         return u * (rho / d) ** 2
     # of rho = (L^2 - d^2) / (2 (L - d.u)), L and d both by one metre
@@ -308,7 +290,6 @@ def intersection(a: Gaussian, b: Gaussian) -> Gaussian:
     return Gaussian(mean, P)
 
 
-@jit
 def _intersection(
     a: np.ndarray, of_a: np.ndarray, b: np.ndarray, of_b: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
@@ -318,18 +299,16 @@ def _intersection(
     values, U = np.linalg.eigh(root @ ((A + A.T) / 2) @ root.T)
     V = root.T @ U
     lengths = np.sum(V**2, axis=0)
-    low, high = 0.0, 1.0
-    if np.sum(lengths * (values - 1)) <= 0:
-        high = 0.0
-    elif np.sum(lengths * (values - 1) / values**2) >= 0:
-        low = 1.0
-    while high - low > 1e-15:
-        w = (low + high) / 2
-        if np.sum(lengths * (values - 1) / (w * values + 1 - w) ** 2) > 0:
-            low = w
-        else:
-            high = w
-    w = (low + high) / 2
+
+    def slope(w: float) -> float:
+        return float(np.sum(lengths * (values - 1) / (w * values + 1 - w) ** 2))
+
+    if slope(0.0) <= 0:
+        w = 0.0
+    elif slope(1.0) >= 0:
+        w = 1.0
+    else:
+        w = brentq(slope, 0.0, 1.0, xtol=1e-15)
     P = (V / (w * values + 1 - w)) @ V.T
     return P @ (w * (A @ a) + (1 - w) * (B @ b)), P, w
 
@@ -410,7 +389,6 @@ def _solved(
     return [Gaussian(m, p) for m, p in zip(*every, strict=True)]
 
 
-@jit
 def _solution(
     num_bodies: int,
     num_errors: int,
@@ -423,34 +401,22 @@ def _solution(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Means and covariances of the bodies from W words, of which the last error is in none."""
     B, b = np.zeros((num_bodies, SIZE, SIZE)), np.zeros((num_bodies, SIZE))
-    C = np.zeros((num_bodies, SIZE, num_errors))
+    C = np.zeros((num_bodies, num_errors, SIZE))
     E, e = np.eye(num_errors), np.zeros(num_errors)
-    A = np.zeros((SIZE, SIZE + ERRORS))
-    A[:, :SIZE] = np.eye(SIZE)
-    for k in range(numbers.size):
-        n, at = numbers[k], errors[k]
-        A[:, SIZE:] = levers[k]
-        gain = weights[k] * np.linalg.solve(covariances[k], A).T
-        each, more = gain @ A, gain @ means[k]
-        B[n] += each[:SIZE, :SIZE]
-        b[n] += more[:SIZE]
-        for j in range(ERRORS):
-            e[at[j]] += more[SIZE + j]
-            C[n, :, at[j]] += each[:SIZE, SIZE + j]
-            for i in range(ERRORS):
-                E[at[i], at[j]] += each[SIZE + i, SIZE + j]
-    D, d = np.empty_like(C), np.empty_like(b)
-    for n in range(num_bodies):
-        D[n], d[n] = np.linalg.solve(B[n], C[n]), np.linalg.solve(B[n], b[n])
-        E -= C[n].T @ D[n]
-        e -= C[n].T @ d[n]
+    A = np.concatenate([np.broadcast_to(np.eye(SIZE), (len(levers), SIZE, SIZE)), levers], axis=2)
+    gain = weights[:, None, None] * np.swapaxes(np.linalg.solve(covariances, A), 1, 2)
+    each, more = gain @ A, (gain @ means[..., None])[..., 0]
+    np.add.at(B, numbers, each[:, :SIZE, :SIZE])
+    np.add.at(b, numbers, more[:, :SIZE])
+    np.add.at(e, errors, more[:, SIZE:])
+    np.add.at(C, (numbers[:, None], errors), each[:, SIZE:, :SIZE])
+    np.add.at(E, (errors[:, :, None], errors[:, None, :]), each[:, SIZE:, SIZE:])
+    D, d = np.linalg.solve(B, np.swapaxes(C, 1, 2)), np.linalg.solve(B, b[..., None])[..., 0]
+    E -= (C @ D).sum(axis=0)
+    e -= (C @ d[..., None])[..., 0].sum(axis=0)
     rest = np.linalg.inv(E)
-    error = rest @ e
-    for n in range(num_bodies):
-        b[n] = d[n] - D[n] @ error
-        P = np.linalg.inv(B[n]) + D[n] @ rest @ D[n].T
-        B[n] = (P + P.T) / 2
-    return b, B
+    P = np.linalg.inv(B) + D @ rest @ np.swapaxes(D, 1, 2)
+    return d - D @ (rest @ e), (P + np.swapaxes(P, 1, 2)) / 2
 
 
 def _teller(key: Key) -> str:
@@ -471,31 +437,18 @@ def distances(
         return np.zeros((len(a), len(b))), np.zeros((len(a), len(b)))
     means = [np.array([g.mean for g in of]) for of in (a, b)]
     covariances = [np.array([g.covariance for g in of]) for of in (a, b)]
-    d2, log_det = _distances(*means, *covariances, gate(probability))
+    y = means[0][:, None] - means[1][None]
+    trace = covariances[0].trace(axis1=1, axis2=2)[:, None] + covariances[1].trace(axis1=1, axis2=2)
+    most = gate(probability)
+    i, j = np.nonzero((y**2).sum(axis=-1) <= most * trace)  # no variance is larger
+    d2, log_det = np.full((2, *y.shape[:2]), np.inf)
+    near, of_near = mahalanobis(y[i, j], covariances[0][i] + covariances[1][j])
+    inside = near <= most
+    d2[i[inside], j[inside]] = near[inside]
+    log_det[i[inside], j[inside]] = of_near[inside]
     return d2, log_det
 
 
-@jit
-def _distances(
-    a: np.ndarray, b: np.ndarray, of_a: np.ndarray, of_b: np.ndarray, most: float
-) -> tuple[np.ndarray, np.ndarray]:
-    d2, log_det = np.full((len(a), len(b)), np.inf), np.full((len(a), len(b)), np.inf)
-    work, traces = np.empty((SIZE + 1, SIZE)), np.array([np.trace(P) for P in of_b])
-    for i in range(len(a)):
-        trace = np.trace(of_a[i])
-        for j in range(len(b)):
-            square = 0.0
-            for k in range(SIZE):
-                square += (a[i, k] - b[j, k]) ** 2
-            if square > most * (trace + traces[j]):  # no variance is larger
-                continue
-            here = distance(a[i] - b[j], of_a[i] + of_b[j], work)
-            if here[0] <= most:
-                d2[i, j], log_det[i, j] = here
-    return d2, log_det
-
-
-@jit
 def cross(e: np.ndarray) -> np.ndarray:
     """(3, 3) matrix of the cross product with e from the left."""
     x, y, z = e
