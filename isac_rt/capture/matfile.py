@@ -1,8 +1,9 @@
 """Numeric arrays and structs of numeric arrays in MATLAB files: version 5, and version 7.3 by h5py.
 
 Only what holds numbers is read. Every size is checked before anything is made of it, so that a
-file cannot ask for more memory than `MOST_BYTES`, and nothing in it is ever run. scipy's reader
-unfolds compressed parts and nested cells without a limit, which is why it is not used.
+file cannot ask for more memory than `MOST_BYTES`, and nothing in it is ever run.
+`scipy.io.loadmat` (1.17) is not used: it unfolds compressed variables without a limit, and an
+unknown type of number ends the process (a segmentation fault).
 """
 
 from __future__ import annotations
