@@ -23,8 +23,6 @@ import numpy as np
 import scipy.fft
 
 from isac_rt.hardware import settings
-from isac_rt.kernels.jit import jit
-from isac_rt.kernels.vector import LANES, load, splat, store
 from isac_rt.randomness import generator
 
 SLOWEST = 0.1
@@ -36,7 +34,6 @@ _STEPS = 8  # samples of a slower band's highest frequency
 _SIZE, _FASTEST_SIZE = 8192, 65_536
 _FADE = 8  # a block's length over that of its overlap
 _SPAN = 4  # samples that a place between two is interpolated from
-_SUMMED = 16  # values of a record to each sum that its means are made from
 
 
 @dataclass(frozen=True)
@@ -108,14 +105,10 @@ class Record(NamedTuple):
     def means(self, duration: float) -> Callable[[np.ndarray], np.ndarray]:
         """Gives the mean phase over `duration` [s] from any times on [rad]: the difference of two
         integrals, of straight lines between the values."""
-        total = np.zeros(self.values.size // _SUMMED + 1)
-        _sum_up(total, self.values)
+        integral = self._replace(values=self.step * (np.cumsum(self.values) - self.values / 2))
 
         def mean(begin: np.ndarray) -> np.ndarray:
-            out = np.empty(np.shape(begin))
-            place = ((begin - self.start) / self.step).ravel()
-            _mean(out.reshape(-1), self.values, total, place, duration / self.step)
-            return out
+            return (integral.at(begin + duration) - integral.at(begin)) / duration
 
         return mean
 
@@ -129,82 +122,19 @@ def cubic(share: np.ndarray) -> np.ndarray:
     return np.stack(parts, axis=-1)
 
 
-@jit(fast=True)
-def _sum_up(total, values):
-    """Sums of the values before each `_SUMMED`-th one."""
-    for k in range(total.shape[0] - 1):
-        a, b, c, d = 0.0, 0.0, 0.0, 0.0
-        for n in range(_SUMMED * k, _SUMMED * (k + 1), 4):
-            a, b, c, d = a + values[n], b + values[n + 1], c + values[n + 2], d + values[n + 3]
-        total[k + 1] = total[k] + (a + b + c + d)
+def _between(coarse: np.ndarray, ratio: int, first: int, count: int) -> np.ndarray:
+    """Interpolate by the cubic through four values, `ratio` times as densely.
 
-
-@jit(fast=True)
-def _integral(values, total, place):
-    """Of straight lines between the values up to a place, by the cubic through four of its own."""
-    first = int(np.floor(place))
-    x = place - first
-    back, ahead, far = x + 1, x - 1, x - 2
-    weight = -x * ahead * far / 6, back * ahead * far / 2, -back * x * far / 2, back * x * ahead / 6
-    whole = (first - 1) // _SUMMED
-    before, out = total[whole], 0.0
-    for n in range(whole * _SUMMED, first - 1):
-        before += values[n]
-    for i in range(_SPAN):
-        value = values[first - 1 + i]
-        out += weight[i] * (before + value / 2)
-        before += value
-    return out
-
-
-@jit(fast=True)
-def _mean(out, values, total, place, length):
-    """Means of the values over `length` of their steps from each place on."""
-    for i in range(out.shape[0]):
-        end = _integral(values, total, place[i] + length)
-        out[i] = (end - _integral(values, total, place[i])) / length
-
-
-@jit(fast=True)
-def _add_between(out, coarse, first, ratio):
-    """Add the cubic through `coarse` at places `ratio` to one of its steps, from `first` on."""
-    for n in range(out.shape[0]):
-        k = (first + n) // ratio
-        x = (first + n - k * ratio) / ratio
-        back, ahead, far = x + 1, x - 1, x - 2
-        near = back * ahead * far / 2 * coarse[k] - back * x * far / 2 * coarse[k + 1]
-        out[n] += near - x * ahead * far / 6 * coarse[k - 1] + back * x * ahead / 6 * coarse[k + 2]
-
-
-@jit(fast=True)
-def _between(out, coarse, weight, first):
-    """The cubic through `coarse` at as many places between two of its values as the (4, ratio)
-    `weight` has columns, the first of them `first` places after its second value."""
-    ratio = weight.shape[1]
-    whole = ratio - ratio % LANES
-    for n in range(first // ratio * ratio, out.shape[0] + first, ratio):
-        k = n // ratio
-        a, b, c, d = coarse[k], coarse[k + 1], coarse[k + 2], coarse[k + 3]
-        low, high = max(n, first), min(n + ratio, out.shape[0] + first)
-        done = low
-        if high - low == ratio:
-            done += whole
-            before, here = splat(a), splat(b)
-            after, beyond = splat(c), splat(d)
-            for i in range(0, whole, LANES):
-                value = before * load(weight[0], i) + here * load(weight[1], i)
-                value = value + after * load(weight[2], i) + beyond * load(weight[3], i)
-                store(out, n - first + i, value)
-        for i in range(done, high):
-            w = weight[:, i - n]
-            out[i - first] = a * w[0] + b * w[1] + c * w[2] + d * w[3]
-
-
-@jit(fast=True)
-def _add_faded(out, block, weight):
-    """Add a block, faded at its ends."""
-    for n in range(out.shape[0]):
-        out[n] += np.float64(weight[n] * block[n])
+    Parameters
+    ----------
+    coarse : values at the dense places 0, `ratio`, 2 `ratio`, ...
+    first, count : dense places of the result, from `ratio` on
+    """
+    windows = np.lib.stride_tricks.sliding_window_view(coarse, _SPAN)
+    begin, end = first // ratio - 1, (first + count - 1) // ratio
+    dense = windows[begin:end] @ cubic(np.arange(ratio) / ratio).T
+    skipped = first % ratio
+    return dense.ravel()[skipped : skipped + count]
 
 
 @dataclass(frozen=True)
@@ -265,11 +195,8 @@ class Oscillator:
             size = (low + segments + _SPAN) // coarse + _SPAN - begin
             own = np.zeros(size)
             self._add_band(own, number, band, begin)
-            _add_between(total, own, low - 1 - begin * coarse, coarse)
-        out = np.empty(count)
-        weight = np.ascontiguousarray(cubic(np.arange(ratio) / ratio).T)
-        _between(out, total, weight, first - low * ratio)
-        return out
+            total += _between(own, coarse, low - 1 - begin * coarse, total.size)
+        return _between(total, ratio, first - (low - 1) * ratio, count)
 
     def _add_band(self, out: np.ndarray, number: int, band: _Band, first: int) -> None:
         """Add one band at the places of its own grid from `first` on."""
@@ -282,7 +209,7 @@ class Oscillator:
                 continue
             inside = slice(low - begin, high - begin)
             block = _block(self, number, index)
-            _add_faded(out[low - first : high - first], block[inside], weight[inside])
+            out[low - first : high - first] += weight[inside] * block[inside]
 
 
 def _sine(angle: float, first: float, count: int) -> np.ndarray:

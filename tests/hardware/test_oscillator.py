@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.signal import welch
 
-from isac_rt.hardware.oscillator import Mask, Oscillator, Record, _add_between, cubic, spread
+from isac_rt.hardware.oscillator import Mask, Oscillator, Record, _between, cubic, spread
 from isac_rt.signal.chain import add_phases
 
 RATE = 20e6
@@ -158,12 +158,11 @@ def test_spread_adds_up():
 
 
 def test_bands_are_read_between_their_values():
-    """A third-degree polynomial is exact; it is added to what is there."""
+    """A third-degree polynomial is exact. Planted bug: a window that begins one value later."""
     poly = np.polynomial.Polynomial([0.3, -1.1, 0.07, 0.013])
-    out = np.arange(61.0)
-    _add_between(out, poly(np.arange(14)), 19, 7)
-    truth = poly((19 + np.arange(61)) / 7)
-    np.testing.assert_allclose(out - np.arange(61), truth, atol=1e-11)
+    for first, count in ((19, 61), (7, 1), (14, 7), (20, 3)):
+        found = _between(poly(np.arange(14)), 7, first, count)
+        np.testing.assert_allclose(found, poly((first + np.arange(count)) / 7), atol=1e-11)
 
 
 def test_rows_of_samples_lie_in_the_phase():
