@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.kernels.jit import jit
-from isac_rt.kernels.receive_maps import lobe_bound
 from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.receive.cfar import hann_envelope
 from isac_rt.receive.maps import UNION_FLOOR
 from isac_rt.receive.types import Detections
 
@@ -52,24 +51,19 @@ def owners(kind: np.ndarray, target: np.ndarray, paths: PathSet, names: list[str
     return out
 
 
-@jit
-def hann_response(distance: float) -> float:
-    """Power of a Hann-windowed tone at a distance of 0 or more cells, relative to its peak."""
-    if distance == 0 or distance == 1:
-        return 1.0 if distance == 0 else 0.25
-    x = np.pi * distance
-    return (np.sin(x) / x / (1 - distance * distance)) ** 2
+def hann_response(distance: np.ndarray) -> np.ndarray:
+    """Power of a Hann-windowed tone at distances from it in cells, relative to its peak."""
+    d = np.asarray(distance, float)
+    edge = np.abs(d) == 1
+    return np.where(edge, 0.25, (np.sinc(d) / np.where(edge, 1.0, 1 - d * d)) ** 2)
 
 
-@jit
-def reach(distance: float) -> float:
-    """Share of a path's power that is counted at a distance in cells: all within one cell, then
-    what the Hann window passes at most."""
-    if distance <= 1:
-        return 1.0
-    if distance < 2:
-        return max(hann_response(distance), lobe_bound(2.0))
-    return lobe_bound(distance)
+def reach(distance: np.ndarray) -> np.ndarray:
+    """Share of a path's power that is counted at distances in cells: all within one cell, then what
+    the Hann window passes at most."""
+    d = np.asarray(distance, float)
+    lobes = hann_envelope(np.maximum(d, 2.0))
+    return np.where(d <= 1, 1.0, np.where(d < 2, np.maximum(hann_response(d), lobes), lobes))
 
 
 class Places(NamedTuple):
@@ -107,15 +101,6 @@ class Places(NamedTuple):
         off = velocity - self.velocity
         off -= self.span * np.round(off / self.span)
         return np.abs(range - self.range) / self.cells[0], np.abs(off) / self.cells[1]
-
-
-@jit
-def cells_apart(
-    range: float, velocity: float, cells: tuple[float, float], span: float
-) -> tuple[float, float]:
-    """`Places.apart` of one place, from the differences of range and velocity."""
-    velocity -= span * np.round(velocity / span)
-    return abs(range) / cells[0], abs(velocity) / cells[1]
 
 
 class Aim(NamedTuple):
@@ -158,14 +143,13 @@ def explain(
     diffuse = paths.kind == PathKind.DIFFUSE
     if aim is None:
         aim = Aim(np.full((len(paths), 2), np.nan), np.ones(2))
-    cause, near = _causes(
-        (detections.range, detections.velocity, detections.direction),
-        (places.range, places.velocity, aim.direction),
-        (places.cells, places.span, tuple(aim.beam)),
-        power,
-        np.flatnonzero(diffuse),
-        np.flatnonzero(~diffuse),
-    )
+    cause, near = np.full(len(detections), -1), np.zeros(len(detections), bool)
+    seen = zip(detections.range, detections.velocity, detections.direction, strict=True)
+    for q, (metres, rate, direction) in enumerate(seen):
+        some = _candidates((metres, rate), direction, places, aim, power, diffuse)
+        best = some.cause()
+        if best >= 0:
+            cause[q], near[q] = some.path[best], some.near[best]
     found = np.flatnonzero(cause >= 0)
     rows, count = cause[found], len(detections)
     kinds, targets, orders, faces = (
@@ -179,73 +163,65 @@ def explain(
     return Explanation(kinds, targets, orders, faces, (cause >= 0) & ~near)
 
 
-@jit
-def _causes(
-    detections: tuple[np.ndarray, ...],
-    paths: tuple[np.ndarray, ...],
-    scales: tuple[tuple[float, float], float, tuple[float, float]],
+class _Candidates(NamedTuple):
+    """Paths that may have caused one detection, in C rows.
+
+    Attributes
+    ----------
+    path : (C,) row of the path
+    near : (C,) bool, within one cell of the detection
+    power : (C,) of a single path at the detection's place, over the noise; 0 of diffuse ones
+    clutter : (C,) of a diffuse path, 0 of the others
+    off : (C,) distance in direction in beams, NaN where it is not known
+    """
+
+    path: np.ndarray
+    near: np.ndarray
+    power: np.ndarray
+    clutter: np.ndarray
+    off: np.ndarray
+
+    def strongest(self, able: np.ndarray) -> int:
+        """Row of the candidate of most power among those that are `able`, -1 if none explains
+        anything; all their clutter counts as the strongest of it."""
+        power, clutter = np.where(able, self.power, 0.0), np.where(able, self.clutter, 0.0)
+        if clutter.any():
+            power[clutter.argmax()] = clutter.sum()
+        best = int(power.argmax()) if power.size else -1
+        return best if best >= 0 and power[best] >= EXPLAINS else -1
+
+    def cause(self) -> int:
+        """Row of the candidate that caused the detection, -1 for none."""
+        aimed = self.off <= 1
+        best = self.strongest(aimed)
+        if best >= 0 and not self.near[best]:
+            best = self.strongest(aimed & self.near & (self.off < self.off[best]))
+        if best < 0:
+            best = self.strongest(np.ones(len(self.path), bool))
+        return best
+
+
+def _candidates(
+    place: tuple[float, float],
+    direction: np.ndarray,
+    places: Places,
+    aim: Aim,
     power: np.ndarray,
-    field: np.ndarray,
-    others: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Row of the path that caused each of Q detections (range, velocity and direction), -1 for
-    none, and whether it lies within a cell of it; `scales` are the two cells, the span of
-    velocities and the two beams."""
-    (ranges, velocities, directions), (at, rate, towards) = detections, paths
-    cells, span, (wide, high) = scales
-    close_by = cells[0] * (1 + 1e-9)
-    cause, beside = np.full(ranges.size, -1), np.zeros(ranges.size, np.bool_)
-    most = field.size + others.size
-    rows, near, able = np.empty(most, np.int64), np.empty(most, np.bool_), np.empty(most, np.bool_)
-    here, clutter, off = np.empty(most), np.empty(most), np.empty(most)
-    for q in range(ranges.size):
-        count = 0
-        for i in others:
-            row, column = cells_apart(ranges[q] - at[i], velocities[q] - rate[i], cells, span)
-            share = reach(row) * min(reach(column) + UNION_FLOOR, 1.0)
-            rows[count], near[count] = i, row <= 1 and column <= 1
-            here[count], clutter[count] = power[i] * share, 0.0
-            count += 1
-        for i in field:
-            if abs(ranges[q] - at[i]) > close_by:  # most are, which no division needs to tell
-                continue
-            row, column = cells_apart(ranges[q] - at[i], velocities[q] - rate[i], cells, span)
-            if row <= 1 and column <= 1:
-                rows[count], near[count] = i, True
-                here[count], clutter[count] = 0.0, power[i]
-                count += 1
-        for c in range(count):
-            x = abs(towards[rows[c], 0] - directions[q, 0]) / wide
-            z = abs(towards[rows[c], 1] - directions[q, 1]) / high
-            off[c] = max(x, z) if x + z >= 0 else np.nan
-            able[c] = off[c] <= 1
-        best = _strongest(here, clutter, able, count)
-        if best >= 0 and not near[best]:
-            for c in range(count):
-                able[c] &= near[c] and off[c] < off[best]
-            best = _strongest(here, clutter, able, count)
-        if best < 0 or not near[best]:
-            able[:] = True
-            best = _strongest(here, clutter, able, count)
-        if best >= 0:
-            cause[q], beside[q] = rows[best], near[best]
-    return cause, beside
-
-
-@jit
-def _strongest(power: np.ndarray, clutter: np.ndarray, able: np.ndarray, count: int) -> int:
-    """Of the first `count` paths the one of most power that is `able`, -1 if none explains
-    anything; all clutter counts as its strongest. `power` is of single paths, `clutter` of those
-    that count together."""
-    first, total = -1, 0.0
-    for c in range(count):
-        if able[c] and clutter[c] > 0:
-            total += clutter[c]
-            if first < 0 or clutter[c] > clutter[first]:
-                first = c
-    best, most = -1, 0.0
-    for c in range(count):
-        mine = total if c == first else power[c]
-        if able[c] and mine >= EXPLAINS and mine > most:
-            best, most = c, mine
-    return best
+    diffuse: np.ndarray,
+) -> _Candidates:
+    """The paths that may have caused a detection at a range and velocity; of the diffuse ones
+    those within a cell."""
+    close = np.abs(place[0] - places.range) <= places.cells[0] * (1 + 1e-9)
+    path = np.flatnonzero(~diffuse | close)
+    some = places._replace(range=places.range[path], velocity=places.velocity[path])
+    row, column = some.apart(*place)
+    near, field = (row <= 1) & (column <= 1), diffuse[path]
+    share = reach(row) * np.minimum(reach(column) + UNION_FLOOR, 1.0)
+    off = np.abs(aim.direction[path] - direction) / aim.beam
+    return _Candidates(
+        path,
+        near,
+        np.where(field, 0.0, power[path] * share),
+        np.where(field & near, power[path], 0.0),
+        np.max(off, axis=1),
+    )

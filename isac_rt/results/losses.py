@@ -12,13 +12,11 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import Transmission
 from isac_rt.frame.schedule import is_latin
 from isac_rt.frame.waveform import Waveform
-from isac_rt.kernels.jit import jit
-from isac_rt.kernels.receive_maps import lobe_bound
 from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.receive.cfar import STRONG, CfarRule
+from isac_rt.receive.cfar import STRONG, CfarRule, hann_envelope
 from isac_rt.receive.maps import UNION_FLOOR
 from isac_rt.receive.settings import Receivers
-from isac_rt.results.labels import Places, cells_apart, hann_response
+from isac_rt.results.labels import Places, hann_response
 
 MATCHED_DB = 13.0
 """SNR under which a coherent matched filter is taken to see nothing: with 13.1 dB it finds a steady
@@ -154,18 +152,12 @@ class Chance:
         life = max(min(paths.end[own], half) - max(paths.begin[own], -half), 0.0) / (2 * half)
         beat = float(w.beat_cells(paths.delay[own], paths.delay_rate[own], 0.0))
         doppler = places.velocity[own] / places.cells[1]
-        off_grid = hann_response(abs(beat - round(beat))) * hann_response(
-            abs(doppler - round(doppler))
+        off_grid = float(
+            hann_response(beat - round(beat)) * hann_response(doppler - round(doppler))
         )
         mine = power[own]
-        clutter, background, masked = _around(
-            (places.range - places.range[own], places.velocity - places.velocity[own]),
-            (places.cells, places.span),
-            power,
-            paths.kind == PathKind.DIFFUSE,
-            (mine, mine * off_grid, sees.cell),
-            (sees.rule.guard, sees.rule.training),
-        )
+        diffuse = paths.kind == PathKind.DIFFUSE
+        clutter, background, masked = _around(own, places, power, diffuse, mine * off_grid, sees)
         return cls(
             float(sees.matched * life * mine),
             float(sees.cell * life**2 * mine * off_grid),
@@ -175,46 +167,41 @@ class Chance:
         )
 
 
-@jit
 def _around(
-    off: tuple[np.ndarray, np.ndarray],
-    scales: tuple[tuple[float, float], float],
+    own: int,
+    places: Places,
     power: np.ndarray,
     diffuse: np.ndarray,
-    levels: tuple[float, float, float],
-    blocks: tuple[tuple[int, int], tuple[int, int]],
+    in_cell: float,
+    sees: Sensitivity,
 ) -> tuple[float, float, bool]:
-    """Power of the clutter in a path's cell; what K paths add to the greater of the means before
-    and behind it, over the noise; and whether a stronger one covers it.
+    """Power of the clutter in a path's cell; what the other paths add to the greater of the means
+    before and behind it, over the noise; and whether a stronger one covers it.
 
     Parameters
     ----------
-    off : (K,) ranges and velocities beyond the path's
-    scales : cells of both and the span of velocities
-    power : (K,); what is over `STRONG` is kept out of the training
-    levels : the path's power, that in its cell, and what makes SNR of power in a cell
-    blocks : guard and training cells
+    own : row of the path
+    power : (K,) of all paths; what is over `STRONG` is kept out of the training
+    in_cell : the path's power in its cell
     """
-    (cells, span), (mine, in_cell, gain), (guard, training) = scales, levels, blocks
+    guard, training = sees.rule.guard, sees.rule.training
+    off = places.range - places.range[own]
+    most = max(guard[0] + training[0] + 1, 2) * places.cells[0]
+    some = np.flatnonzero(~diffuse | (np.abs(off) < most))
+    off, level, field = off[some], power[some], diffuse[some]
+    near = places._replace(range=places.range[some], velocity=places.velocity[some])
+    row, column = near.apart(places.range[own], places.velocity[own])
+    beside = field & (row < 2) & (column < 2)
+    clutter = level[beside] @ (hann_response(row[beside]) * hann_response(column[beside]))
+    strong = ~field & (level > power[own])
+    lobes = hann_envelope(row[strong]) * (hann_envelope(column[strong]) + UNION_FLOOR)
+    masked = (SIDELOBE_MARGIN * level[strong] * lobes >= in_cell).any()
     width = guard[1] + training[1] + 0.5
-    clutter, before, behind, masked = 0.0, 0.0, 0.0, False
-    most = max(guard[0] + training[0] + 1, 2) * cells[0]
-    for i in range(power.size):
-        if diffuse[i] and abs(off[0][i]) >= most:  # of most it is this that is asked alone
-            continue
-        row, column = cells_apart(off[0][i], off[1][i], cells, span)
-        if diffuse[i] and row < 2 and column < 2:
-            clutter += power[i] * hann_response(row) * hann_response(column)
-        if not diffuse[i] and power[i] > mine:
-            lobes = lobe_bound(row) * (lobe_bound(column) + UNION_FLOOR)
-            masked |= SIDELOBE_MARGIN * power[i] * lobes >= in_cell
-        along = row - guard[0] - 0.5
-        if 0 < along <= training[0] and column <= width and gain * power[i] < STRONG:
-            if off[0][i] > 0:
-                behind += gain * power[i]
-            else:
-                before += gain * power[i]
-    return clutter, max(before, behind) * HANN_LOSS**2 / (training[0] * 2 * width), masked
+    along, snr = row - guard[0] - 0.5, sees.cell * level
+    trained = (along > 0) & (along <= training[0]) & (column <= width) & (snr < STRONG)
+    behind, before = snr[trained & (off > 0)].sum(), snr[trained & (off <= 0)].sum()
+    mean = max(before, behind) * HANN_LOSS**2 / (training[0] * 2 * width)
+    return float(clutter), float(mean), bool(masked)
 
 
 def cause_of(

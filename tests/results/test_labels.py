@@ -193,7 +193,7 @@ def test_response_is_that_of_the_window():
     d = np.concatenate([np.linspace(0, 9, 181), [0.31, 1.0, 1.5]])
     truth = np.array([abs(window @ np.exp(2j * np.pi * x * n / size)) ** 2 for x in d])
     truth /= window.sum() ** 2
-    responses, reached = np.vectorize(hann_response)(d), np.vectorize(reach)(d)
+    responses, reached = hann_response(d), reach(d)
     assert responses == pytest.approx(truth, abs=1e-6)
     assert (reached >= truth - 1e-6).all()
     assert reach(0.7) == reach(1.0) == 1.0
@@ -234,7 +234,7 @@ def plainly(detections, paths, waveform, passes, cell_gain, aim=None) -> Explana
     beside = places.cells[0] * (1 + 1e-9)  # what is a cell away to the last digit is asked later
     count = len(detections)
     apart = rows_of(places, others).apart(detections.range[:, None], detections.velocity[:, None])
-    along, across = (np.vectorize(reach)(d) for d in apart)
+    along, across = (reach(d) for d in apart)
     shares = along * np.minimum(across + UNION_FLOOR, 1.0)
     close = (apart[0] <= 1) & (apart[1] <= 1)
     kinds, targets, orders, faces = (
