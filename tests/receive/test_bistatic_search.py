@@ -9,10 +9,9 @@ from receiver_cubes import ANTENNAS, Path, cube, frame
 
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive.clutter.adaptive import scanned
+from isac_rt.receive.clutter.adaptive import field_threshold, scanned
 from isac_rt.receive.clutter.bistatic import (
     _Beam,
-    field_threshold,
 )
 from isac_rt.receive.directions import receiver_search, search_plain, search_white
 from isac_rt.receive.estimate import LocalSpectra, refine

@@ -13,7 +13,7 @@ chi-squared field of two degrees of freedom):
 .. math:: e^{-t}\,(1 + \mu_1\sqrt{t/\pi} + \mu_2 (2t - 1)/(2\pi)),
 
 mu the length and area of the scanned directions in units of the correlation length, which follows
-from the variances of the channels' places.
+from the variances of the channels' places; summed over n looks 2 T has 2 n degrees of freedom.
 
 References
 ----------
@@ -29,7 +29,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, optimize, special
 
 from isac_rt.receive.arms import Channels
 from isac_rt.receive.cfar import CfarRule, strong_lobes
@@ -61,39 +61,25 @@ def scanned_within(
     return (sides[0] * width[0], sides[1] * width[1]), area * width[0] * width[1]
 
 
-def expected_count(t: np.ndarray | float, lengths: tuple[float, ...], area: float) -> np.ndarray:
-    """Mean Euler characteristic of {T > t} over directions of such lengths and area (`scanned`); at
-    least that of one beam."""
-    t = np.asarray(t, float)
-    more = sum(lengths) * np.sqrt(np.maximum(t, 0) / np.pi)
-    more = more + area * np.maximum(2 * t - 1, 0) / (2 * np.pi)
-    return np.exp(-t) * (1 + more)
+def expected_count(t: float, lengths: tuple[float, ...], area: float, looks: int = 1) -> float:
+    """Return the mean Euler characteristic of {T > t} over directions of such lengths and area
+    (`scanned`), T a sum of `looks` unit exponentials; at least that of one beam."""
+    shape = t ** (looks - 1) * np.exp(-t) / special.gamma(looks)
+    edges = sum(lengths) * np.sqrt(t / np.pi) * shape
+    inside = area * max(2 * t - (2 * looks - 1), 0.0) * shape / (2 * np.pi)
+    return float(special.gammaincc(looks, t) + edges + inside)
 
 
-@lru_cache(maxsize=64)
-def threshold_of(sizes: tuple[tuple[tuple[float, ...], float], ...], rate: float) -> float:
-    """What the sum over several scans' maxima exceeds at this rate, the scans of such lengths and
-    areas (`scanned`) taken as independent.
+@lru_cache(maxsize=256)
+def field_threshold(lengths: tuple[float, ...], area: float, looks: int, rate: float) -> float:
+    """Return what the largest T over directions exceeds at this rate: it is below t with
+    probability exp(-`expected_count`)."""
+    aim = -np.log1p(-rate)
 
-    The largest of one scan is below t with probability exp(-`expected_count`).
-    """
-    grid = np.arange(0, 200, 0.01)
-    density = np.zeros_like(grid)
-    density[0] = 1.0
-    for lengths, area in sizes:
-        below = np.exp(-expected_count(grid, lengths, area))
-        one = np.diff(np.maximum.accumulate(below), prepend=0.0)
-        size = 2 * grid.size
-        density = np.fft.irfft(np.fft.rfft(density, size) * np.fft.rfft(one, size), size)[
-            : grid.size
-        ]
-    # below 1e-12 the transforms have no digits left: every tail is exp(-t) times a slow factor
-    # there
-    tail = np.cumsum(density[::-1])[::-1]
-    trusted = np.flatnonzero(tail > 1e-10)[-1]
-    if rate >= tail[trusted]:
-        return float(np.interp(-np.log(rate), -np.log(tail[: trusted + 1]), grid[: trusted + 1]))
-    return float(grid[trusted] + np.log(tail[trusted] / rate))
+    def excess(t: float) -> float:
+        return float(np.log(expected_count(t, lengths, area, looks) / aim))
+
+    return float(optimize.brentq(excess, looks, 400.0))
 
 
 def unexplained(

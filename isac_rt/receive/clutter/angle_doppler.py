@@ -20,7 +20,7 @@ from isac_rt.receive.cfar import (
     leaked,
     strongest_peaks,
 )
-from isac_rt.receive.clutter.adaptive import LEAST_CLUTTER, scanned, threshold_of, unexplained
+from isac_rt.receive.clutter.adaptive import LEAST_CLUTTER, field_threshold, scanned, unexplained
 from isac_rt.receive.clutter.correction import fit
 from isac_rt.receive.clutter.covariance import Bucketed
 from isac_rt.receive.clutter.gates import Gate, gates_of, seek
@@ -230,7 +230,7 @@ class AngleDoppler:
         """Thresholds of a detection and of one that may start a track."""
         size = scanned(search.channels, known.wavenumber, known.antennas.view_limit)
         usual, sure = self.settings.false_alarm_rates
-        return threshold_of((size,), usual), threshold_of((size,), sure)
+        return field_threshold(*size, 1, usual), field_threshold(*size, 1, sure)
 
 
 def _gates(

@@ -19,10 +19,8 @@ The search is separable as at the active terminal (`isac_rt.receive.directions`)
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
-from scipy import optimize, special
 
 from isac_rt.receive.cfar import (
     LOBE_MARGIN,
@@ -30,7 +28,7 @@ from isac_rt.receive.cfar import (
     hann_envelope,
     strongest_peaks,
 )
-from isac_rt.receive.clutter.adaptive import LEAST_CLUTTER, scanned, unexplained
+from isac_rt.receive.clutter.adaptive import LEAST_CLUTTER, field_threshold, scanned, unexplained
 from isac_rt.receive.clutter.angle_doppler import noise_level
 from isac_rt.receive.clutter.covariance import Bucketed
 from isac_rt.receive.clutter.power import TAPER, expected_power
@@ -195,22 +193,6 @@ class Remainder:
             search.spread(TAPER.cosine) / (np.abs(c) ** 2).mean(axis=2).sum(axis=1)[:, None, None]
         )
         return power[:, None, None] * each.astype(np.complex64)[owner]
-
-
-@lru_cache(maxsize=64)
-def field_threshold(lengths: tuple[float, ...], area: float, looks: int, rate: float) -> float:
-    """What the largest of a sum of `looks` unit exponential fields exceeds at this rate: by the
-    mean Euler characteristic of a chi-squared field (Worsley, see `adaptive`)."""
-
-    def count(t: float) -> float:
-        shape = np.exp((looks - 1) * np.log(2 * t) - t - (looks - 1) * np.log(2))
-        shape /= special.gamma(looks)
-        edges = sum(lengths) * np.sqrt(2 * t) * shape / np.sqrt(2 * np.pi)
-        inside = area * max(2 * t - (2 * looks - 1), 0.0) * shape / (2 * np.pi)
-        return float(special.gammaincc(looks, t) + edges + inside)
-
-    aim = -np.log1p(-rate)
-    return float(optimize.brentq(lambda t: np.log(count(t) / aim), looks, 400.0))
 
 
 class _Beam(LocalSpectra):

@@ -12,9 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 
-from isac_rt.receive.clutter.adaptive import expected_count, scanned_within
+from isac_rt.receive.clutter.adaptive import field_threshold, scanned_within
 from isac_rt.receive.directions import Found, Search, inverses, statistic_of
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import Gates
@@ -51,8 +50,7 @@ class Gate:
     def threshold(self, search: Search, rate: float) -> float:
         """What noise exceeds somewhere in the gate with probability `rate` at most."""
         size = scanned_within(search.channels, search.wavenumber, 2 * self.half)
-        share = rate / self.cell.size
-        return float(brentq(lambda t: np.log(expected_count(t, *size) / share), 1.0, 100.0))
+        return field_threshold(*size, 1, rate / self.cell.size)
 
 
 def gates_of(expected: Gates, known: Known, rows: int) -> Iterator[Gate]:
