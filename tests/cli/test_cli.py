@@ -353,7 +353,7 @@ def test_warnings_are_said_as_they_stand(scenario_file, simulation, tmp_path, ca
 
 
 def test_help_of_every_command_says_its_options(capsys):
-    for name, option in (("run", "--set"), ("sweep", "--retry-failed"), ("bench", "--fit")):
+    for name, option in (("run", "--set"), ("sweep", "--retry-failed"), ("bench", "--json")):
         assert main([name, "--help"]) == 0
         assert option in capsys.readouterr().out
 
