@@ -420,7 +420,7 @@ def search_directions(
     beams = beams + np.einsum("stkj,ki->stij", along_z, turns_x[0] + 1j * turns_x[1])
     power = (np.abs(beams) ** 2).sum(axis=1) * scale
     size = power.shape[1]
-    best = (power * inside.reshape(size, size)).reshape(len(power), -1).argmax(axis=1)
+    best = (power.reshape(-1, size * size) * inside).argmax(axis=1)
     for s, at in enumerate(zip(*np.divmod(best, size), strict=True)):
         peak[s], place[s] = power[s][at], at
         for axis, line in enumerate((power[s][:, at[1]], power[s][at[0]])):

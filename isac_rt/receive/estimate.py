@@ -406,10 +406,10 @@ def fill_strongest(
         beams = np.einsum("qtl,qgl->qtg", values, np.exp(1j * u[..., None] * apart))
         return (np.abs(beams) ** 2).sum(axis=1)
 
-    grid = np.tile(np.linspace(-limit, limit, count), (len(values), 1))
-    most, step = power(grid), 2 * limit / (count - 1)
+    grid = np.linspace(-limit, limit, count)
+    most, step = power(np.tile(grid, (len(values), 1))), 2 * limit / (count - 1)
     first = (most >= most.max(axis=1, keepdims=True) / (1 + TIE)).argmax(axis=1)
-    out[:] = grid[0, first]
+    out[:] = grid[first]
     for part in (2.0, 12.0, 60.0) if fine else ():
         near = step / part
         three = power(out[:, None] + near * np.array([-1, 0, 1]))

@@ -265,14 +265,14 @@ def test_sums_of_tones_against_tones(passes: int):
     """Planted bugs in the kernel: the turn between receivers left out; n^2 from sample 0."""
     known, made = two_tones(np.random.default_rng(14), passes)
     weights = powers_of_time(known, 3)
-    pairs = np.array([[1, 0], [2, 1], [0, 2]])
-    for powers in (1, 3):  # n^q in samples: one size of numbers at a time
-        out = np.zeros((3, powers, 3, 3, ANTENNAS.num_rx), complex)
+    pairs = np.array([[1, 0], [2, 1], [0, 2], [1, 1]])  # the last of one frequency
+    for powers in (1, 3):
+        out = np.zeros((4, powers, 3, 3, ANTENNAS.num_rx), complex)
         kernel, twin = TWINS["isac_rt.receive.joint.tones.fill_cross_sums"]
         by_kernel, by_twin = out.copy(), out.copy()
         kernel(made, pairs, weights, by_kernel)
         twin(made, pairs, weights, by_twin)
-        most = np.abs(by_twin).max(axis=(3, 4), keepdims=True)
+        most = np.abs(by_twin).max(axis=(0, 3, 4), keepdims=True)  # n^q t^i: sizes of their own
         assert (np.abs(by_kernel - by_twin) <= 1e-6 * most).all()  # of the nodes
 
 
