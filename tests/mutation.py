@@ -84,7 +84,7 @@ TESTS_OF = {
     "track/tracker.py": "test_association test_handover test_tracking",
     "track/terminal.py": "test_handover test_terminal",
     "track/reference.py": "test_handover test_terminal",
-    "track/images.py": "test_images",
+    "track/images.py": "test_images test_track_twins",
     "track/ghosts.py": "test_ghost_images test_ghosts",
     "access/protocol.py": "test_access_stages test_access_protocol",
     "access/synchronise.py": "test_access_synchronise test_access_answers",

@@ -10,23 +10,20 @@ buildings is not asked for: an image that is not there only forbids births in a 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
-from isac_rt.kernels.jit import jit
+from isac_rt.kernels import track_images
+from isac_rt.kernels.jit import twin_of
+from isac_rt.kernels.track_images import EDGE, LEAST_RANGE
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import Ambiguity, wrapped
 from isac_rt.track.parts import Own, TrackRule
 from isac_rt.track.walls import Walls
 from isac_rt.world.swarm import Pose
 
-EDGE = 0.3
-"""How far beyond the edge of a face a reflection is still taken for possible [m]: the planes of a
-corner need not meet exactly."""
-LEAST_RANGE = 1.0
 BESIDE_CELLS = 1.5
 """Off an image by no more cells of range and of rate than these, a detection is taken for it."""
 WELL_INSIDE = 0.95
@@ -118,9 +115,9 @@ def _by_one(
     some = s * e > 0
     n, s, e, near = n[some], s[some], e[some], near[some]
     image = start[:3] - 2 * s[:, None] * n
-    met = p + (image - p) * (e / (e + s))[:, None]
+    point = p + (image - p) * (e / (e + s))[:, None]
     ways = _ways(image, start[3:] - 2 * (n @ start[3:])[:, None] * n, end)
-    on = walls.holds(near, met, EDGE) & (ways[:, 0] < reach) & (ways[:, 0] > 2 * LEAST_RANGE)
+    on = walls.holds(near, point, EDGE) & (ways[:, 0] < reach) & (ways[:, 0] > 2 * LEAST_RANGE)
     return ways[on]
 
 
@@ -134,8 +131,7 @@ def _by_two(
     """The wave over plane i, then j, comes from the image p_ij of the start's image in i; it meets
     j at B, and i at A."""
     _, normals, offsets = walls.mirrors
-    planes = _Planes(normals, offsets, *walls.boxes)
-    pairs, places = _met(start[:3], end[:3], planes, *near, reach)
+    pairs, places = met(start[:3], end[:3], normals, offsets, *walls.boxes, *near, reach)
     i, j = pairs.T
     A, B, at_j = places.swapaxes(0, 1)
     kept = walls.holds(i, A, EDGE) & walls.holds(j, B, EDGE)
@@ -145,85 +141,45 @@ def _by_two(
     return _ways(at_j, turned, end)
 
 
-class _Planes(NamedTuple):
-    """Normals (W, 3), offsets (W,) and corners of the boxes (W, 3) of mirrors."""
-
-    normals: np.ndarray
-    offsets: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-
-@jit
-def _met(
+@twin_of(track_images.met)
+def met(
     start: np.ndarray,
     end: np.ndarray,
-    planes: _Planes,
+    normals: np.ndarray,
+    offsets: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
     first: np.ndarray,
     last: np.ndarray,
     reach: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (K, 2) of mirrors over which a way may lead, with A, B and p_ij (K, 3, 3)."""
-    pairs, places, count = np.empty((64, 2), np.int64), np.empty((64, 3, 3)), 0
-    once, at_j, A, B = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    before = np.array([_dot(planes.normals[j], end) - planes.offsets[j] for j in last])
-    x, y, z = planes.normals[last].T.copy()
-    offsets, beyond = planes.offsets[last], np.empty(last.size)
-    some = np.empty(last.size, np.int64)
+    """Pairs (K, 2) of mirrors, one of `first` and one of `last`, over which a path of at most
+    `reach` [m] may lead from `start` to `end` (3,), with A, B and p_ij (K, 3, 3).
+
+    Mirrors have normals (W, 3), offsets (W,) and boxes from `low` to `high` (W, 3). A point x has
+    the image x - 2 (n.x - d) n; the square of its distance from a point on its own side is longer
+    by 4 (n.x - d) (n.y - d) than that of x itself.
+    """
+    pairs, places = [np.zeros((0, 2), np.int64)], [np.zeros((0, 3, 3))]
+    before = normals[last] @ end - offsets[last]
     for i in first:
-        n, d = planes.normals[i], planes.offsets[i]
-        s, apart = _dot(n, start) - d, 0.0
-        for c in range(3):
-            once[c] = start[c] - 2 * s * n[c]
-            apart += (once[c] - end[c]) ** 2
-        for k in range(last.size):
-            beyond[k] = x[k] * once[0] + y[k] * once[1] + z[k] * once[2] - offsets[k]
-        # a mirror between two points makes the square of the way between them longer by four times
-        # the product of their distances from it
-        least = max((2 * LEAST_RANGE) ** 2 - apart, 0.0) / 4
-        most, chosen = (reach**2 - apart) / 4, 0
-        for k in range(last.size):  # without branches
-            some[chosen] = k
-            chosen += least < beyond[k] * before[k] < most
-        for k in some[:chosen]:
-            j = last[k]
-            if i == j:
-                continue
-            for c in range(3):
-                at_j[c] = once[c] - 2 * beyond[k] * planes.normals[j, c]
-            # from the image behind j to the end before it
-            if not _within(at_j, end, beyond[k] / (beyond[k] + before[k]), planes, j, B):
-                continue
-            height = _dot(n, B) - d
-            if not height * s > -EDGE * abs(s):
-                continue
-            if not _within(once, B, s / (s + height), planes, i, A):
-                continue
-            if count == len(pairs):
-                pairs = np.concatenate((pairs, np.empty_like(pairs)))
-                places = np.concatenate((places, np.empty_like(places)))
-            pairs[count, 0], pairs[count, 1] = i, j
-            places[count, 0], places[count, 1], places[count, 2] = A, B, at_j
-            count += 1
-    return pairs[:count], places[:count]
-
-
-@jit
-def _dot(a: np.ndarray, b: np.ndarray) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@jit
-def _within(
-    a: np.ndarray, b: np.ndarray, share: float, planes: _Planes, mirror: int, out: np.ndarray
-) -> bool:
-    """Whether the place that lies so far on the way from a to b, put into `out`, is in the box of a
-    mirror or within `EDGE` of it."""
-    for c in range(3):
-        out[c] = a[c] + (b[c] - a[c]) * share
-        if not planes.low[mirror, c] - EDGE <= out[c] <= planes.high[mirror, c] + EDGE:
-            return False
-    return True
+        s = normals[i] @ start - offsets[i]
+        once = start - 2 * s * normals[i]
+        apart, beyond = ((once - end) ** 2).sum(), normals[last] @ once - offsets[last]
+        longer = 4 * beyond * before
+        some = (longer > max((2 * LEAST_RANGE) ** 2 - apart, 0)) & (longer < reach**2 - apart)
+        some &= last != i
+        j, share = last[some], (beyond[some] / (beyond[some] + before[some]))[:, None]
+        at_j = once - 2 * beyond[some, None] * normals[j]
+        B = at_j + (end - at_j) * share
+        height = B @ normals[i] - offsets[i]
+        A = once + (B - once) * (s / (s + height))[:, None]
+        on = height * s > -EDGE * abs(s)
+        for point, of in ((B, j), (A, i)):
+            on &= ((low[of] - EDGE <= point) & (point <= high[of] + EDGE)).all(axis=1)
+        pairs.append(np.column_stack([np.full(on.sum(), i), j[on]]))
+        places.append(np.stack([A, B, at_j], axis=1)[on])
+    return np.concatenate(pairs), np.concatenate(places)
 
 
 def _ways(places: np.ndarray, motions: np.ndarray, end: np.ndarray) -> np.ndarray:

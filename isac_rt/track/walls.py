@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 
-from isac_rt.kernels.jit import jit
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
@@ -94,7 +93,16 @@ class Walls:
     def holds(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
         """Whether points (n, 3) in the planes of mirrors (n,) lie on one of their faces, or within
         `edge` of it."""
-        out: np.ndarray = held(mirrors, points - self.city.origin, *self._sides, edge)
+        corners, inward, first = self._sides
+        count = first[mirrors + 1] - first[mirrors]
+        which = np.repeat(np.arange(mirrors.size), count)
+        begins = np.cumsum(count) - count
+        face = np.arange(which.size) + np.repeat(first[mirrors] - begins, count)
+        offset = points[which, None] - self.city.origin - corners[face]
+        heights = (inward[face] * offset).sum(axis=2)
+        inside = heights >= -edge * np.linalg.norm(inward[face], axis=2)
+        out = np.zeros(mirrors.size, bool)
+        out[which[inside.all(axis=1)]] = True
         return out
 
     @cached_property
@@ -122,29 +130,3 @@ class Walls:
         return np.flatnonzero(
             (slope != 0) & (share > 0) & (share < 1) & np.logical_and.reduce(inside)
         )
-
-
-@jit
-def held(
-    mirrors: np.ndarray,
-    points: np.ndarray,
-    corners: np.ndarray,
-    inward: np.ndarray,
-    first: np.ndarray,
-    edge: float,
-) -> np.ndarray:
-    """`Walls.holds`."""
-    out = np.zeros(mirrors.size, np.bool_)
-    for i in range(mirrors.size):
-        for face in range(first[mirrors[i]], first[mirrors[i] + 1]):
-            inside = 0
-            for k in range(3):
-                n, a = inward[face, k], corners[face, k]
-                height = 0.0
-                for c in range(3):
-                    height += n[c] * (points[i, c] - a[c])
-                inside += height >= -edge * np.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
-            if inside == 3:
-                out[i] = True
-                break
-    return out
