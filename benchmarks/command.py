@@ -46,8 +46,7 @@ SCENES: dict[str, tuple[str, int, int, tuple[str, ...]]] = {
 
 def tables(quick: bool) -> list[dict[str, Any]]:
     """One dict for each scene: `scene`, `frames`, `peak_memory_mib`, `paths_per_frame`, `processor`
-    and `wall` [s] by part and ``total``, `stages`, the processor seconds of the frames, and what
-    `isac-rt plan --receivers` says of them and of the set-up, `predicted`."""
+    and `wall` [s] by part and ``total``, `stages`, the processor seconds of the frames."""
     return [measured(name, quick) for name in SCENES]
 
 
@@ -66,11 +65,7 @@ def measured(name: str, quick: bool) -> dict[str, Any]:
         _LOG.info("%s, %s frames, call %s of %s", name, number, call + 1, calls)
         job = json.dumps([file, told, time.time()])
         found = _answer(file, "benchmarks.command", job)
-    overrides = [word for change in told for word in ("--set", change)]
-    _LOG.info("%s, what its plan says", name)
-    asked = ["plan", str(SCENE_FILES / file), "--receivers", "--json", *overrides]
-    predicted = _answer(file, "isac_rt.cli.cli", *asked)["seconds_of_run"]
-    return {"scene": name, "frames": number, **found, "predicted": predicted}
+    return {"scene": name, "frames": number, **found}
 
 
 def _answer(file: str, module: str, *arguments: str) -> dict[str, Any]:
@@ -173,10 +168,7 @@ def markdown(found: list[dict[str, Any]]) -> list[str]:
         lines.append(f"| {part} [s] | {' | '.join(cells)} |")
     for stage in found[0]["stages"]:
         cells = [f"{one['stages'][stage]:.2f}" for one in found]
-        if stage in found[0]["predicted"]:
-            said = [f"{one['predicted'][stage]:.2f}" for one in found]
-            cells = [f"{was} ({plan})" for was, plan in zip(cells, said, strict=True)]
-        lines.append(f"| {stage}, all frames (by the plan) [s] | {' | '.join(cells)} |")
+        lines.append(f"| {stage}, all frames [s] | {' | '.join(cells)} |")
     for key, title in (
         ("peak_memory_mib", "peak memory [MiB]"),
         ("paths_per_frame", "paths a frame"),

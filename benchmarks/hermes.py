@@ -30,7 +30,7 @@ INTERPRETER = "ISAC_RT_HERMESPY"
 """Variable of the environment: a Python with HermesPy."""
 SIZES = (100, 1000)
 QUICK_SIZES = (20, 60)
-OURS = ("gridded narrowband, 1.25 N, width 6", "gridded wideband, 1.5 N, width 6")
+OURS = ("gridded",)
 _LONGEST_S = 900
 _SCRIPT = Path(__file__).with_name("hermespy_job.py")
 
@@ -83,11 +83,9 @@ def errors() -> dict[str, float]:
     """Relative RMS error of our settings on 40 static paths."""
     job = job_of(3)
     links = job.paths(40)
-    truth = {True: job.samples(links, Exact()), False: job.narrowband(links)}
+    truth = job.samples(links, Exact())
     return {
-        name: relative(job.samples(links, method), truth[method.setting.wideband])
-        for name, method in GRIDS
-        if name in OURS
+        name: relative(job.samples(links, method), truth) for name, method in GRIDS if name in OURS
     }
 
 

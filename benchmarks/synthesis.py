@@ -29,8 +29,7 @@ from isac_rt.hardware.settings import FrontEnd
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.known import Known
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.signal.gridded import ACCURATE, COVERING, DEFAULT, PROFILES, Setting
-from isac_rt.signal.if_signal import if_signal, range_profiles
+from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, Method
 from isac_rt.signal.noise import WhiteNoise, add_white_noise
 from isac_rt.signal.received import received
@@ -42,21 +41,15 @@ QUICK_SIZES = (3, 1000)
 MOST_DIRECT = 30
 REAL_SIZE = 1000
 PROFILE_SIZES = (3, 30, 1000, 10_000)
-BOTH = "samples (gridded wideband, 1.5 N, width 6), Hann window, transform, data out"
+BOTH = "samples (gridded), Hann window, transform, data out"
 JOB = "3 x 120 x 1024 x 15, data on, |v| <= 15 m/s"
 ERROR_OF = "relative RMS against the exact model"
 GRIDS = (
-    ("gridded narrowband, 2.25 N, width 4", Gridded(Setting(2.25, 4, False))),
-    ("gridded narrowband, 1.25 N, width 6", Gridded(Setting(1.25, 6, False))),
-    ("gridded narrowband, 1.5 N, width 6", Gridded(replace(DEFAULT, wideband=False))),
-    ("gridded narrowband, 1.5 N, width 8", Gridded(replace(ACCURATE, wideband=False))),
-    ("gridded wideband, 2.25 N, width 4", Gridded(Setting(2.25, 4, True))),
-    ("gridded wideband, 1.25 N, width 6", Gridded(Setting(1.25, 6, True))),
-    ("gridded wideband, 1.5 N, width 6", Gridded(DEFAULT)),
-    ("gridded wideband, cubic, 1.5 N, width 8", Gridded(ACCURATE)),
-    ("gridded wideband, 1.5 N, width 12 over 4", Gridded(COVERING)),
-    ("gridded, 1.5 N, width 4, of what noise covers", Gridded(COVERING, faint=True)),
+    ("gridded", Gridded()),
+    ("gridded, of what noise covers", Gridded(faint=True)),
 )
+
+
 REAL: dict[str, dict[str, Any]] = {
     "oscillators": {"preset": "pll_good"},
     "elements": {
@@ -71,10 +64,6 @@ REAL: dict[str, dict[str, Any]] = {
     "ramps": {"ramp": {"quadratic_hz": 2e4, "ripple_hz": 1e4}},
 }
 """Parts of front ends whose cost is measured by itself, and together."""
-DIRECTLY = (
-    ("profiles directly, 1.25 N, width 6", PROFILES),
-    ("profiles directly, cubic, 1.5 N, width 8", ACCURATE),
-)
 
 
 class Job:
@@ -138,16 +127,6 @@ class Job:
         cube = self.cube(links, method)
         return clean_spectrum(cube, Known.of(cube, self.sender.payload, self.antennas, 2))
 
-    def profiles(self, links: list, setting: Setting) -> np.ndarray:
-        return range_profiles(
-            self.waveform,
-            links,
-            self.receiver,
-            Reference(0.0),
-            self.sender.payload,
-            setting=setting,
-        ).spectra
-
     def ends(self, stated: dict[str, Any]) -> Ends:
         """One terminal to another with such front ends."""
         node = FrontEnd.model_validate(stated)
@@ -194,16 +173,14 @@ def errors() -> dict[str, float]:
     """Error of every method on 40 paths and 3 chirps per group."""
     job = Job(3)
     links = job.paths(40)
-    full, narrow = job.samples(links, Exact()), job.narrowband(links)
+    full = job.samples(links, Exact())
     found = {"direct": relative(job.samples(links, Direct()), full)}
     for name, method in GRIDS:
-        truth = full if method.setting.wideband else narrow
-        found[name] = relative(job.samples(links, method), truth)
+        found[name] = relative(job.samples(links, method), full)
     if nufft.missing() is None:
-        found[nufft.NAME] = relative(job.by_finufft(links), narrow)
+        found[nufft.NAME] = relative(job.by_finufft(links), job.narrowband(links))
     whole = job.transformed(links, Exact())
     found[BOTH] = relative(job.transformed(links, Gridded()), whole)
-    found |= {name: relative(job.profiles(links, setting), whole) for name, setting in DIRECTLY}
     return found
 
 
@@ -289,14 +266,6 @@ def rows(quick: bool) -> list[dict[str, Any]]:
                 cpu_seconds(partial(job.transformed, links, Gridded()), times),
                 error[BOTH],
             )
-            for name, setting in DIRECTLY:
-                add(
-                    name,
-                    size,
-                    "paths",
-                    cpu_seconds(partial(job.profiles, links, setting), times),
-                    error[name],
-                )
     cube = np.zeros(shape, np.complex64)
     words = np.array([1, 2], np.uint32)
     add(

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from isac_rt.scenario.tree import Scenario as Scenario
     from isac_rt.signal.if_signal import add_noise as add_noise
     from isac_rt.signal.if_signal import if_signal as if_signal
-    from isac_rt.signal.if_signal import range_profiles as range_profiles
     from isac_rt.signal.methods import Auto as Auto
     from isac_rt.signal.methods import Direct as Direct
     from isac_rt.signal.methods import Exact as Exact
@@ -90,7 +89,7 @@ _NAMES = {
     "results.recorder": "Results",
     "scenario.file": "load to_yaml",
     "scenario.tree": "Scenario",
-    "signal.if_signal": "add_noise if_signal range_profiles",
+    "signal.if_signal": "add_noise if_signal",
     "signal.methods": "Auto Direct Exact Gridded Separable",
     "simulation.setup": "Frame Setup city_of prepare trace",
     "simulation.simulate": "run standard_terminal",

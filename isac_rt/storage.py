@@ -275,7 +275,7 @@ def source_digest(folder: Path) -> str:
     """Digest of the source and the tables in a folder."""
     digest = hashlib.sha256()
     files = (file for file in folder.rglob("*") if file.suffix in (".py", ".json"))
-    for file in sorted(files):  # JSON: costs decide between methods
+    for file in sorted(files):
         digest.update(f"{file.relative_to(folder)}\0".encode() + file.read_bytes() + b"\0")
     return digest.hexdigest()[:16]
 

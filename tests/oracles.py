@@ -91,15 +91,14 @@ def _norm(v):
     return np.sqrt((v * v).sum())
 
 
-def tones_to_second_order(w, t, wideband, cubic):
+def tones_to_second_order(w, t):
     """IF samples (M, L_rx, P, N) of `Tones` t by the series that the gridded method sums:
 
         z exp(j 2 pi (f0 + f1 n)) s_l exp(-j theta lambda) (1 - c theta^2/2 + j theta (1 + j q k) x
         + (j q - theta^2/2) (x^2 - c)),
 
     x = n/(N/2) from the middle sample, f0, f1 and q the phase's first coefficients there, theta the
-    turn of a receive element over half a chirp, lambda = tau/(T/2), k = 4/15; to the third order
-    with j theta (j q - theta^2/6) (x^3 - 3x/5) and theta^2/10 less of x. Narrowband: theta = 0.
+    turn of a receive element over half a chirp, lambda = tau/(T/2), k = 4/15.
     """
     ld = np.longdouble
     step, half = ld(1) / ld(w.sampling_rate), w.num_samples // 2
@@ -133,11 +132,9 @@ def tones_to_second_order(w, t, wideband, cubic):
         bow = 2 * np.pi * bend * half**2
         e = t.rx_delay[k].astype(ld)
         turn = (ld(w.carrier_frequency) + slope * middle) * e - slope * e**2 / 2
-        theta = (2 * np.pi * slope * step * half * e * wideband).astype(float)[:, None]
-        third = theta * cubic
+        theta = (2 * np.pi * slope * step * half * e).astype(float)[:, None]
         series = 1 - c * theta**2 / 2 + (1j * bow - theta**2 / 2) * (x**2 - c)
-        series = series + 1j * theta * (1 + 4j / 15 * bow - third**2 / 10) * x
-        series = series + 1j * third * (1j * bow - third**2 / 6) * (x**3 - 3 / 5 * x)
+        series = series + 1j * theta * (1 + 4j / 15 * bow) * x
         start = np.exp(2j * np.pi * (turn % 1).astype(float))[:, None]
         start = start * np.exp(-1j * theta * float(tau / (step * half)))
         tone = z * np.exp(2j * np.pi * (f0 + f1 * n) + 1j * bow * c)

@@ -29,7 +29,7 @@ DEBUG = "ISAC_RT_DEBUG"
 COMMANDS: dict[Callable[..., None], str] = {
     simulation.run: "run scenes/munich_swarm.yaml --out runs/munich --set noise.tx_power_dbm=20",
     simulation.demo: "demo --out first_look",
-    simulation.plan: "plan scenes/munich_swarm.yaml --set accuracy.preset=fastest",
+    simulation.plan: "plan scenes/munich_swarm.yaml --set accuracy.preset=everything",
     simulation.paths: "paths scenes/street_canyon.yaml --frame 3 --out paths.nc",
     simulation.view: "view scenes/street_canyon.yaml --out scene.html",
     simulation.animate: "animate runs/munich --out runs/munich/run.mp4",

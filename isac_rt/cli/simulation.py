@@ -252,12 +252,9 @@ def _say_summary(results: Results) -> None:
 def plan(
     scenario: ScenarioFile,
     as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
-    receivers: Annotated[
-        bool, typer.Option("--receivers", help="Time the reception of one frame too.")
-    ] = False,
     overrides: Overrides = None,
 ) -> None:
-    """What a run will model, what it leaves out, and the estimated error and time of each; traces a
+    """What a run will model, what it leaves out and why, and the estimated error of each; traces a
     few frames only."""
     from isac_rt.scenario.file import load
 
@@ -267,15 +264,15 @@ def plan(
         from isac_rt.simulation.setup import prepare
 
         setup = prepare(loaded)
-        found = make_plan(setup, receivers)
+        found = make_plan(setup)
     if as_json:
         typer.echo(json.dumps(found | {"city": setup.city.record()}, indent=1))
     else:
         _say_city(setup.city.notes)
-        _say_plan(found, loaded.frames)
+        _say_plan(found)
 
 
-def _say_plan(found: dict[str, Any], frames: int) -> None:
+def _say_plan(found: dict[str, Any]) -> None:
     """The plan of `isac_rt.simulation.audit.make_plan`."""
     _say_coverage(found["coverage"])
 
@@ -290,11 +287,10 @@ def _say_plan(found: dict[str, Any], frames: int) -> None:
             item["modelled"],
             item["left_out"],
             error(item),
-            "" if item["seconds"] is None else f"{item['seconds']:.3f}",
         )
         for item in found["items"]
     ]
-    say_table(("", "link", "modelled", "left out", "error", "s/frame"), rows, numbers=False)
+    say_table(("", "link", "modelled", "left out", "error"), rows, numbers=False)
     out().print(_PLAN_WORDS)
     settled = {
         "phase error at most [rad]": found["max_phase_error_rad"],
@@ -303,15 +299,6 @@ def _say_plan(found: dict[str, Any], frames: int) -> None:
     }
     said = ", ".join(f"{name}: {value}" for name, value in settled.items() if value is not None)
     say(f"preset {found['preset']}; {said}")
-    once, whole = found["seconds_once"], found["seconds_of_run"]
-    first = sum(once.values()) - once["setup"]
-    stages = ", ".join(f"{stage} {whole[stage]:.3g}" for stage in found["seconds_per_frame"])
-    heard = "" if "receive" in whole else "receivers (--receivers), "
-    say(
-        f"processor time of the run without {heard}loading and drawing: about "
-        f"{sum(whole.values()):.3g} s: {once['setup']:.3g} s of set-up, and for {frames} frames "
-        f"{stages}, of which {first:.3g} s in the first one, for what is loaded"
-    )
 
 
 def paths(

@@ -142,20 +142,3 @@ class SharedCube(IFCube):
     def made(self) -> dict[str, Any]:
         """By name."""
         return {}
-
-
-@dataclass(frozen=True, kw_only=True)
-class RangeProfiles:
-    """What a terminal that knows the data makes of its samples first, made directly.
-
-    Attributes
-    ----------
-    spectra : (M, L_rx, cells, P) complex64, the data taken out, under Hann's window: see
-        `isac_rt.receive.spectrum.clean_spectrum`
-    waveform, schedule, start_time : as of an `IFCube`
-    """
-
-    spectra: np.ndarray
-    waveform: Waveform
-    schedule: Schedule
-    start_time: float

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import IFCube, RangeProfiles
+from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.schedule import codes_of
 from isac_rt.receive.chain import Refiner, detector_of, filter_of, refiner_of
@@ -36,7 +36,7 @@ class ActiveReceiver:
 
     def receive(
         self,
-        cube: IFCube | RangeProfiles,
+        cube: IFCube,
         payload: Payload,
         hints: Hints = NO_HINTS,
         *,
@@ -44,17 +44,14 @@ class ActiveReceiver:
     ) -> Reception:
         """See `receive_active`."""
         known = Known.of(cube, payload, self.antennas, 2)
-        if isinstance(cube, IFCube):
-            spectra, known = cleaned(cube, known)
-        else:
-            spectra = cube.spectra
+        spectra, known = cleaned(cube, known)
         if self.clutter_filter is not None:
             spectra = spectra.copy()
             self.clutter_filter.clean(spectra, cube.schedule, codes_of(cube.waveform))
         spectra, known = known.decoded(spectra)
         found = self.detector.sense(spectra, known, hints)
         detections = found.detections
-        if self.refiner is not None and isinstance(cube, IFCube):
+        if self.refiner is not None:
             detections = self.refiner(Moments(cube.samples, known), detections)[0]
         picture = make_maps(found.power, cube, self.settings, 2) if maps else None
         out = Reception.undecoded(
@@ -67,7 +64,7 @@ class ActiveReceiver:
 
 
 def receive_active(
-    cube: IFCube | RangeProfiles,
+    cube: IFCube,
     payload: Payload,
     antennas: Antennas,
     settings: Receivers,
@@ -79,8 +76,7 @@ def receive_active(
 
     Parameters
     ----------
-    cube : IFCube, received by the terminal that sent `payload`, or its range profiles, with which
-        there is no `joint` refinement
+    cube : IFCube, received by the terminal that sent `payload`
     payload : what the terminal has sent
     antennas : of both ends
     settings : Receivers

@@ -11,7 +11,7 @@ from typing import overload
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import IFCube, RangeProfiles
+from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload, unmodulated
 from isac_rt.frame.schedule import (
     Schedule,
@@ -48,9 +48,7 @@ class Known:
     unambiguous_share: float = 1.0
 
     @classmethod
-    def of(
-        cls, cube: IFCube | RangeProfiles, payload: Payload, antennas: Antennas, passes: int
-    ) -> Known:
+    def of(cls, cube: IFCube, payload: Payload, antennas: Antennas, passes: int) -> Known:
         """What a receiver of a frame knows to which the payload is known."""
         sent = payload.delay_symbols, payload.phases
         return cls(cube.waveform, cube.schedule, *sent, antennas, passes)

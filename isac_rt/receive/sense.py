@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 import scipy.fft
 
-from isac_rt.frame.cube import IFCube, RangeProfiles
+from isac_rt.frame.cube import IFCube
 from isac_rt.receive.cfar import CfarRule, first_row, strongest_peaks
 from isac_rt.receive.estimate import (
     OFF_GRID,
@@ -196,18 +196,14 @@ def equivalent_range_power(cube: IFCube) -> np.ndarray:
     return total / cube.samples.shape[1]
 
 
-def make_maps(
-    power: np.ndarray, cube: IFCube | RangeProfiles, settings: Receivers, passes: int
-) -> Maps:
+def make_maps(power: np.ndarray, cube: IFCube, settings: Receivers, passes: int) -> Maps:
     """Maps with their axes; the range axis ignores the range-Doppler coupling (under a cell)."""
-    w, before, looks = cube.waveform, np.zeros((0, 0)), 1
-    if isinstance(cube, IFCube):
-        before, looks = equivalent_range_power(cube), cube.samples.shape[1]
-    rule = CfarRule.of(settings, looks)
+    w, before = cube.waveform, equivalent_range_power(cube)
+    rule = CfarRule.of(settings, cube.samples.shape[1])
     return Maps(
         range_doppler=power.astype(np.float32),
         range_axis=np.arange(power.shape[0]) * w.range_cell(passes),
         velocity_axis=doppler_bins(w) * w.velocity_cell(passes),
         equivalent_range=np.sqrt(before),
-        equivalent_detections=rule.detect_chirps(before) if before.size else before > 0,
+        equivalent_detections=rule.detect_chirps(before),
     )

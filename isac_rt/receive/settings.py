@@ -23,6 +23,7 @@ class Receivers(Node):
     """How terminals detect targets and decode data."""
 
     REMOVED: ClassVar[dict[str, str]] = {
+        "active_input": "leave it out: every receiver starts from samples",
         "clutter_channels": "leave it out; clutter_detector: angle_doppler filters all antennas",
         "clutter_detector: map": "clutter_detector: angle_doppler, which uses the same mesh",
         "clutter_detector: sample_matrix": "clutter_detector: angle_doppler in a city, else cfar",
@@ -115,23 +116,8 @@ class Receivers(Node):
     all directions alike stays. `positions`: also from the terminals' positions, which they send
     each other, and, where the active terminal's detector knows the city's mesh, from clutter, so
     that directions and clocks are found too."""
-    active_input: Literal["samples", "profiles"] = "samples"
-    """What an active terminal starts from: `samples`, the default, simulates IF samples and
-    transforms them; `profiles` makes range profiles directly, which is faster and has another draw
-    of the noise."""
 
     def problems(self) -> Iterator[Problem]:
-        if self.active_input == "profiles" and self.refinement == "joint":
-            yield Problem(
-                (("active_input",), ("refinement",)),
-                "joint refinement needs samples; set active_input: samples or another one",
-            )
-        if self.active_input == "profiles" and self.self_calibration != "none":
-            yield Problem(
-                (("active_input",), ("self_calibration",)),
-                "self-calibration corrects samples; set active_input: samples, or "
-                "self_calibration: none",
-            )
         if self.refinement == "grid" and self.velocity_method == "pursuit":
             yield Problem(
                 (("refinement",), ("velocity_method",)),

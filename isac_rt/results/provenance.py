@@ -105,8 +105,8 @@ def run_content(scenario: Scenario, snapshots: int, city: str | None = None) -> 
     """All that the results of a run depend on, as text; `city`: `city_digest`, where it is known
     already."""
     city = city_digest(scenario.city, scenario.folder) if city is None else city
-    named = scenario.cost_model_path(), scenario.calibration_path()
-    files = [city, *("" if file is None else file_digest(file) for file in named)]
+    board = scenario.calibration_path()
+    files = [city, "" if board is None else file_digest(board)]
     return json.dumps(
         [scenario.model_dump(mode="json"), *files, program_fingerprint(), versions(), snapshots],
         sort_keys=True,

@@ -71,13 +71,10 @@ def load(
     except TableError as problem:
         raise ScenarioError(document.complaint(Problem((problem.key,), str(problem)))) from None
     scenario = document.check(Scenario).in_folder(folder)
-    city, costs = scenario.city, scenario.cost_model_path()
+    city = scenario.city
     if city is not None and city.file is not None and not os.path.isfile(scenario.city_path()):
         said = f"no such file in {folder}; the path is relative to the scenario's folder"
         raise ScenarioError(document.complaint(Problem((("city", "file"),), said)))
-    if costs is not None and not os.path.isfile(costs):
-        said = f"no such file in {folder}; make one with isac-rt bench --fit {costs}"
-        raise ScenarioError(document.complaint(Problem((("accuracy", "cost_model"),), said)))
     board = scenario.calibration_path()
     if board is not None and not os.path.isfile(board):
         said = f"no such file in {folder}; make one with isac-rt calibrate --out {board}"
@@ -150,7 +147,7 @@ def to_yaml(scenario: Scenario, folder: str | os.PathLike[str] | None = None) ->
     ----------
     scenario : Scenario
     folder : where the text will be saved, if not beside the original: `city.file` and
-        `accuracy.cost_model` are then written relative to it, and `radio.calibration` too
+        `radio.calibration` are then written relative to it
 
     Returns
     -------
@@ -159,9 +156,6 @@ def to_yaml(scenario: Scenario, folder: str | os.PathLike[str] | None = None) ->
     data = plain_tree(scenario)
     if folder is not None and scenario.city is not None and scenario.city.file is not None:
         data["city"]["file"] = os.path.relpath(scenario.city_path(), folder)
-    costs = scenario.cost_model_path()
-    if folder is not None and costs is not None:
-        data["accuracy"]["cost_model"] = os.path.relpath(costs, folder)
     board = scenario.calibration_path()
     if folder is not None and board is not None:
         data["radio"]["calibration"] = os.path.relpath(board, folder)

@@ -144,8 +144,8 @@ class Scenario(Node):
 
     @property
     def folder(self) -> Path:
-        """Folder of the scenario file, to which `city.file`, `accuracy.cost_model` and
-        `radio.calibration` are relative; the working folder for a tree made in Python."""
+        """Folder of the scenario file, to which `city.file` and `radio.calibration` are
+        relative; the working folder for a tree made in Python."""
         return self._folder
 
     def in_folder(self, folder: Path) -> Scenario:
@@ -171,11 +171,6 @@ class Scenario(Node):
         if self.city is None or self.city.file is None:
             raise ValueError("the scenario has no city.file")
         return self.folder / self.city.file
-
-    def cost_model_path(self) -> Path | None:
-        """The file of accuracy.cost_model, found from the scenario's folder; None for the costs
-        that ship with the program."""
-        return None if self.accuracy.cost_model is None else self.folder / self.accuracy.cost_model
 
     def calibration_path(self) -> Path | None:
         """The file of radio.calibration, found from the scenario's folder; None without one."""
@@ -296,9 +291,6 @@ class Scenario(Node):
                 f"simo sends from one antenna, and there are {self.num_tx}; set array.tx_x and "
                 "array.tx_z to 1, or take another scheme",
             )
-        if self.receivers.active_input == "profiles":
-            said = "profiles hold at most 3/4 of the range cells, mode fmcw shows all; use samples"
-            yield Problem((("receivers", "active_input"), ("radio", "mode")), said)
         usual: dict[str, tuple[str, ...]] = {
             "velocity_method": ("auto", "latin_union", "conventional")
         }
@@ -460,23 +452,9 @@ class Scenario(Node):
                 yield Problem(((*at, "self_calibration"), ("radio", "groups")), said)
 
     def _front_end_problems(self) -> Iterator[Problem]:
-        real = [
-            name
-            for name, uav in self.swarm.items()
-            if uav.role != "target" and not self.front_end_of(name).ideal
-        ]
-        if self.radio.calibration is not None and self.receivers.active_input == "profiles":
-            said = "profiles are made past the samples, which a calibration corrects; take samples"
-            yield Problem((("receivers", "active_input"), ("radio", "calibration")), said)
         if self.radio.calibration is not None and self.radio.bands(self.num_tx) > 1:
             said = "gains of antennas that send at once cannot be told in the samples; take tdm"
             yield Problem((("radio", "scheme"), ("radio", "calibration")), said)
-        if real and self.receivers.active_input == "profiles":
-            said = (
-                f"profiles are made past the samples, in which the front end of {real[0]} shows; "
-                "take samples, or leave radio.front_end ideal"
-            )
-            yield Problem((("receivers", "active_input"), ("radio", "front_end")), said)
         stated: dict[Key, FrontEnd] = {("radio", "front_end"): self.radio.front_end}
         stated |= {
             ("swarm", name, "front_end"): uav.front_end
@@ -579,7 +557,7 @@ class Scenario(Node):
             if name == OWN:
                 said = "is the name of the scenario's own receivers; choose another"
                 yield Problem((("compare", name),), said)
-            for key in ("active_every_frames", "active_input"):
+            for key in ("active_every_frames",):
                 own, other = getattr(self.receivers, key), getattr(one.receivers, key)
                 if own != other:
                     yield Problem(

@@ -8,6 +8,7 @@ import numpy as np
 
 from isac_rt.hardware.oscillator import OVERSAMPLING, Record, cubic
 from isac_rt.kernels.jit import jit
+from isac_rt.kernels.signal_noise import add_stream
 from isac_rt.kernels.vector import (
     LANES,
     aligned,
@@ -26,7 +27,6 @@ from isac_rt.kernels.vector import (
     zip_high,
     zip_low,
 )
-from isac_rt.signal.noise import add_stream
 
 
 @jit(fast=True)

@@ -5,11 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from isac_rt.frame.cube import IFCube, RangeProfiles, ReceiveArray, Reference
-from isac_rt.frame.payload import Payload
+from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import Waveform
-from isac_rt.signal.gridded import ACCURATE, GRIDDED_ERROR, PROFILES, Setting, range_cells
 from isac_rt.signal.methods import Auto, Method
 from isac_rt.signal.noise import SILENCE, WhiteNoise, add_white_noise
 from isac_rt.signal.tones import Links, Tones, tones_of
@@ -102,51 +100,6 @@ def noisy_if_signal(
     schedule, tones = heard(waveform, links, receiver, reference)
     return IFCube(
         samples=method.samples(waveform, tones, noise),
-        waveform=waveform,
-        schedule=schedule,
-        start_time=reference.start_time,
-    )
-
-
-def range_profiles(
-    waveform: Waveform,
-    links: Links,
-    receiver: ReceiveArray,
-    reference: Reference,
-    payload: Payload,
-    *,
-    noise: WhiteNoise | None = None,
-    num_cells: int | None = None,
-    setting: Setting | None = None,
-) -> RangeProfiles:
-    """Range profiles of a receiver that knows the data and never looks at its samples: Hann's
-    window and noise included.
-
-    The same as `if_signal`, `add_noise` and `isac_rt.receive.spectrum.clean_spectrum` but for the
-    draw of the noise, whose covariance over cells, chirps and receivers is that of windowed and
-    transformed white noise. The joint curvature of lines of sight is left out.
-
-    Parameters
-    ----------
-    waveform, links, receiver, reference : as of `if_signal`
-    payload : whose delay and DPSK symbols are taken out, as they were sent
-    noise : of the IF samples
-    num_cells : range cells, from cell 0; by default those of the delay symbols; at most 3/4 of N
-    setting : by default `PROFILES`, or `ACCURATE` where the error of the strongest path could show
-        above the noise of a cell, as it does where there is none
-
-    Returns
-    -------
-    RangeProfiles
-    """
-    schedule, tones = heard(waveform, links, receiver, reference)
-    if setting is None:
-        size = waveform.num_samples * tones.rx_delay.shape[1] * schedule.size
-        seen = tones.power.max(initial=0.0) * GRIDDED_ERROR**2 * size
-        setting = ACCURATE if seen > (0.0 if noise is None else noise.power) else PROFILES
-    cells = waveform.num_range_cells if num_cells is None else num_cells
-    return RangeProfiles(
-        spectra=range_cells(waveform, tones, payload, cells, setting, noise),
         waveform=waveform,
         schedule=schedule,
         start_time=reference.start_time,

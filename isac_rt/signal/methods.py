@@ -4,28 +4,31 @@ noise."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
 from isac_rt.frame.waveform import Waveform
-from isac_rt.kernels.vector import new_memory
+from isac_rt.kernels import signal_direct, signal_gridded
+from isac_rt.kernels.jit import twin_of
+from isac_rt.kernels.signal_covered import covered_error
+from isac_rt.kernels.signal_gridded import GRIDDED_ERROR, OVERSAMPLING, WIDTH, grid_size
+from isac_rt.kernels.vector import LANES, new_memory
 from isac_rt.propagation.clutter.merging import resolution_cell
-from isac_rt.signal.choice import CANDIDATES, DIRECT, SHIPPED, CostModel, Cover, read
-from isac_rt.signal.covered import covered_error, summed_share
-from isac_rt.signal.direct import add_direct
 from isac_rt.signal.exact import exact
-from isac_rt.signal.gridded import (
-    COVERING,
-    DEFAULT,
-    GRIDDED_ERROR,
-    Setting,
-    grid_size,
-    make_gridded,
-)
 from isac_rt.signal.noise import SILENCE, WhiteNoise
 from isac_rt.signal.separable import separable
 from isac_rt.signal.tones import Tones
+
+ERROR_AT_REST, ERROR_PER_SPEED = 5e-5, 1e-6
+"""Bound of the relative RMS error of a gridded path against the exact model, up to |u| = 0.87 and
+640 MHz: at rest, and more per m/s of c/2 times its delay rate (measured: docs/performance.md)."""
+GRID_PATHS = 150
+"""Paths times receive elements whose tones take as long one by one as one grid of sixteen elements
+(100 to 250, by processor)."""
+MAX_CELLS = 1 << 24
+"""Span of cells whose sums are kept as one array: a hundred times what a link spans. Transmitters
+whose clocks are a second apart span 10^11."""
 
 
 @dataclass(frozen=True)
@@ -80,110 +83,65 @@ class Direct:
     def samples(self, waveform: Waveform, tones: Tones, noise: WhiteNoise = SILENCE) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
         every = np.ones(tones.size, bool)
-        return _made(waveform, tones, noise, Choice(DEFAULT, every, ~every))
+        return _made(waveform, tones, noise, every, ~every)
 
 
 @dataclass(frozen=True)
 class Gridded:
-    """All paths through a grid of frequencies, for many: the error is that of the `setting`, of all
-    or of those that noise covers (`faint`)."""
+    """All paths through a grid of frequencies, for many: relative error `GRIDDED_ERROR`, or as if
+    noise covered all (`faint`: `isac_rt.kernels.signal_covered.covered_error`)."""
 
     name: ClassVar[str] = "gridded"
-    setting: Setting = DEFAULT
     faint: bool = False
 
     def samples(self, waveform: Waveform, tones: Tones, noise: WhiteNoise = SILENCE) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
-        none, faint = np.zeros(tones.size, bool), np.full(tones.size, self.faint)
-        return _made(waveform, tones, noise, Choice(self.setting, none, faint))
-
-
-class Choice(NamedTuple):
-    """Setting of the grid, and which paths (K,) go direct past it; which of the others noise
-    covers."""
-
-    setting: Setting
-    alone: np.ndarray
-    faint: np.ndarray
+        none = np.zeros(tones.size, bool)
+        return _made(waveform, tones, noise, none, none | self.faint)
 
 
 @dataclass(frozen=True)
 class Auto:
-    """All direct, or a grid and some paths direct, whichever is cheapest within an error.
+    """Few paths one by one, many through a grid of frequencies, and of those some one by one.
 
-    Direct go lines of sight (their joint curvature is not gridded); paths too fast for `max_error`;
-    and of those whose error, integrated coherently over the cube, could exceed the noise of a cell
-    (power error^2 size > noise_power), the `max_direct` strongest. Some settings have a faster way
-    with a larger error for paths that noise covers: all of a range-Doppler cell together keep it
-    under `covered` times the noise, integrated coherently over the cube.
+    One by one go lines of sight (their joint curvature is not gridded); paths too fast for
+    `GRIDDED_ERROR`; and of those whose error, integrated coherently over the cube, could exceed the
+    noise of a cell (power error^2 size > noise_power), the `max_direct` strongest. Paths that noise
+    covers take a faster way with a larger error: all of a range-Doppler cell together keep it under
+    `covered` times the noise, integrated coherently over the cube.
 
     Attributes
     ----------
-    noise_power : per complex sample [W]; with 0 the `max_direct` strongest paths go direct
-    max_error : relative RMS error of the samples, at least that of the direct method (1e-6); of
-        those of paths that noise does not cover
-    max_direct : paths that go direct for their strength, at the most
-    costs : what the methods cost; None: what ships with the program
-    decide_for : number of paths whose cost decides, where the links hold some of them only
+    noise_power : per complex sample [W]; with 0 the `max_direct` strongest paths go one by one
+    max_direct : paths that go one by one for their strength, at the most
     covered : error that noise covers, over the noise of a cell of all elements and chirps; 0: no
         path is taken for covered
     """
 
     name: ClassVar[str] = "auto"
     noise_power: float = 0.0
-    max_error: float = GRIDDED_ERROR
     max_direct: int = 16
-    costs: CostModel | None = None
-    decide_for: int | None = None
     covered: float = 0.0
 
     def samples(self, waveform: Waveform, tones: Tones, noise: WhiteNoise = SILENCE) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
-        shape, speed = _shape(waveform, tones), tones.speed(waveform.frame_duration)
-        cover = _cover(waveform, tones) if self.covered and tones.size else None
-        choice = self.choose(shape, tones.power, speed, tones.sight, cover)
-        return _made(waveform, tones, noise, choice)
+        return _made(waveform, tones, noise, *self.choose(waveform, tones))
 
-    def choose(
-        self,
-        shape: tuple[int, ...],
-        power: np.ndarray,
-        speed: np.ndarray,
-        sight: np.ndarray,
-        cover: Cover | None = None,
-    ) -> Choice:
-        """How a cube of this shape (M, L_rx, P, N) is made.
-
-        Parameters
-        ----------
-        power, speed, sight : (K,) of each path: received power [W], c ``|delay rate|`` / 2 [m/s],
-            whether it is a line of sight
-        cover : which paths noise may cover; None: it is taken to cover none
-        """
-        model = self.costs or read(SHIPPED)
-        scale = 1.0 if self.decide_for is None else self.decide_for / max(power.size, 1)
-        size, none = float(np.prod(shape)), np.zeros(power.size, bool)
-        best = Choice(DEFAULT, ~none, none)
-        least = model.seconds(DIRECT, shape, scale * power.size)
-        top = _strongest(power, self.max_direct)
-        for candidate in CANDIDATES:
-            error = candidate.error_at(speed)
-            strong = power * error**2 * size > self.noise_power
-            faint = none
-            if cover is not None:
-                limit = self.covered * self.noise_power / size
-                faint = ~sight & candidate.covered(power, cover, limit)
-            alone = ~faint & ((strong & top) | sight | (error > self.max_error))
-            if alone.all():
-                continue
-            dearer = scale if cover is None else scale * cover.dearer
-            several = scale * int((~alone & ~faint).sum()), dearer * int(faint.sum())
-            cost = model.seconds(candidate.name, shape, *several)
-            if alone.any():
-                cost += model.seconds(DIRECT, shape, scale * int(alone.sum()))
-            if cost < least:
-                best, least = Choice(candidate.setting, alone, faint), cost
-        return best
+    def choose(self, waveform: Waveform, tones: Tones) -> tuple[np.ndarray, np.ndarray]:
+        """Which paths go one by one, and which of the others noise covers, (K,) bool each."""
+        every, elements = np.ones(tones.size, bool), tones.rx_delay.shape[1]
+        size = float(np.prod(_shape(waveform, tones)))
+        error = ERROR_AT_REST + ERROR_PER_SPEED * tones.speed(waveform.frame_duration)
+        strong = tones.power * error**2 * size > self.noise_power
+        faint = ~every
+        if self.covered and tones.size:
+            limit = self.covered * self.noise_power / size
+            faint = ~tones.sight & _covered(waveform, tones, limit)
+        top = _strongest(tones.power, self.max_direct)
+        alone = ~faint & ((strong & top) | tones.sight | (error > GRIDDED_ERROR))
+        if (~alone).sum() * elements <= GRID_PATHS * -(-elements // LANES):
+            return every, ~every
+        return alone, faint
 
 
 Method = Exact | Direct | Gridded | Auto | Separable
@@ -191,12 +149,9 @@ Method = Exact | Direct | Gridded | Auto | Separable
 
 def _strongest(power: np.ndarray, count: int) -> np.ndarray:
     """Which (K,) of some powers are the strongest, so many of them; of equal ones the first."""
-    if count >= power.size:
-        return np.ones(power.size, bool)
-    least = np.partition(power, power.size - count)[power.size - count] if count else np.inf
-    top = power > least
-    top[np.flatnonzero(power == least)[: count - top.sum()]] = True
-    return top
+    out = np.zeros(power.size, bool)
+    out[np.argsort(-power, kind="stable")[:count]] = True
+    return out
 
 
 def _shape(waveform: Waveform, tones: Tones) -> tuple[int, ...]:
@@ -204,24 +159,52 @@ def _shape(waveform: Waveform, tones: Tones) -> tuple[int, ...]:
     return w.num_groups, tones.rx_delay.shape[1], w.num_chirps, w.num_samples
 
 
-def _cover(waveform: Waveform, tones: Tones) -> Cover:
-    """Where paths are seen, and their errors if noise is taken to cover them."""
-    size = grid_size(waveform.num_samples, COVERING.oversampling, COVERING.width)
+def _covered(waveform: Waveform, tones: Tones, limit: float) -> np.ndarray:
+    """Which paths (K,) noise covers: the powers [W] of the errors that all paths of their
+    range-Doppler cell would have stay within a limit."""
+    error = covered_error(waveform, tones, grid_size(waveform.num_samples, OVERSAMPLING, WIDTH))
     cell = resolution_cell(waveform, tones.delay, tones.rate)
-    dearer = summed_share(waveform, tones, size)
-    return Cover(cell, covered_error(waveform, tones, size), dearer)
+    number = cell - cell.min()
+    if number.max() > MAX_CELLS:
+        number = np.unique(number, return_inverse=True)[1]
+    return np.bincount(number, tones.power * error**2)[number] <= limit
 
 
-def _made(waveform: Waveform, tones: Tones, noise: WhiteNoise, choice: Choice) -> np.ndarray:
-    """Samples with some paths made one by one, the others through a grid, and noise."""
-    samples = new_memory(_shape(waveform, tones))
-    setting, alone, faint = choice
-    strong = tones.select(alone)
-    if alone.all():
-        add_direct(samples, waveform, strong, fresh=True)
-        noise.add_to(samples)
+def _fast(
+    samples: np.ndarray,
+    waveform: Waveform,
+    tones: Tones,
+    noise: WhiteNoise,
+    alone: np.ndarray,
+    faint: np.ndarray,
+) -> None:
+    """`add_up` by the kernels."""
+    strong, rest = tones.select(alone), tones.select(~alone)
+    if rest.sources(waveform)[0].size:
+        signal_gridded.make_gridded(samples, waveform, rest, faint[~alone], strong, noise.numbers)
     else:
-        rest = tones.select(~alone)
-        parts = {"faint": faint[~alone], "alone": strong, "noise": noise}
-        make_gridded(samples, waveform, rest, setting, **parts)
+        signal_direct.add_direct(samples, waveform, strong, fresh=True)
+        noise.add_to(samples)
+
+
+@twin_of(_fast)
+def add_up(
+    samples: np.ndarray,
+    waveform: Waveform,
+    tones: Tones,
+    noise: WhiteNoise,
+    alone: np.ndarray,
+    faint: np.ndarray,
+) -> None:
+    """Write the sum of all tones, and noise, to samples (M, L_rx, P, N); `alone` and `faint` say
+    how fast methods make each path (K,)."""
+    samples[:] = exact(waveform, tones)
+    noise.add_to(samples)
+
+
+def _made(
+    waveform: Waveform, tones: Tones, noise: WhiteNoise, alone: np.ndarray, faint: np.ndarray
+) -> np.ndarray:
+    samples = new_memory(_shape(waveform, tones))
+    add_up(samples, waveform, tones, noise, alone, faint)
     return samples

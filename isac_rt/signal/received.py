@@ -30,6 +30,7 @@ from isac_rt.hardware.converter import saturated
 from isac_rt.hardware.front_end import IDEAL, Ends
 from isac_rt.hardware.oscillator import Mask, Oscillator, Record, spread
 from isac_rt.hardware.sweep import Ramp, read_at, sampled, short_read
+from isac_rt.kernels.signal_direct import add_direct
 from isac_rt.signal.chain import (
     NO_ROWS,
     NO_TURNS,
@@ -42,7 +43,6 @@ from isac_rt.signal.chain import (
     places_of,
     rows_of,
 )
-from isac_rt.signal.direct import add_direct
 from isac_rt.signal.if_signal import heard
 from isac_rt.signal.methods import Method
 from isac_rt.signal.noise import WhiteNoise

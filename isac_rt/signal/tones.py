@@ -71,9 +71,27 @@ class Tones(NamedTuple):
             **{
                 name: v.take(rows, axis=0)
                 for name, v in self._asdict().items()
-                if name not in shared and v is not NO_GAIN
+                if name not in shared and v.shape != NO_GAIN.shape
             }
         )
+
+    def sources(self, waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
+        """Find which (path, offset = m - m') can pass the filter in some chirp: indices into the
+        paths, and offsets. Both (C,) int64."""
+        w, t = waveform, self
+        half = w.frame_duration / 2 + w.chirp_duration + w.num_groups * w.group_spacing
+        motion = np.abs(t.rate) * half + np.abs(t.accel) * half**2 / 2
+        longest = float(t.symbol_delay.max(initial=0.0))
+        margin = w.filter_transition / w.slope
+        paths, offsets = [], []
+        for offset in range(1 - w.num_groups, w.num_groups):
+            delay = t.delay - offset * w.group_spacing
+            passes = (delay + motion + longest >= -margin) & (
+                delay - motion <= w.max_delay + margin
+            )
+            paths.append(np.flatnonzero(passes))
+            offsets.append(np.full(paths[-1].size, offset))
+        return np.concatenate(paths), np.concatenate(offsets).astype(np.int64)
 
     def speed(self, duration: float) -> np.ndarray:
         """c/2 times the largest rate of each delay in a frame of this `duration` (K,) [m/s]."""
@@ -135,23 +153,6 @@ def tones_of(
             }
         )
     return Tones(**{name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
-
-
-def sources(waveform: Waveform, tones: Tones) -> tuple[np.ndarray, np.ndarray]:
-    """Which (path, offset = m - m') can pass the filter in some chirp: indices into `tones`,
-    offsets. Both (C,) int64."""
-    w, t = waveform, tones
-    half = w.frame_duration / 2 + w.chirp_duration + w.num_groups * w.group_spacing
-    motion = np.abs(t.rate) * half + np.abs(t.accel) * half**2 / 2
-    longest = float(t.symbol_delay.max(initial=0.0))
-    margin = w.filter_transition / w.slope
-    paths, offsets = [], []
-    for offset in range(1 - w.num_groups, w.num_groups):
-        delay = t.delay - offset * w.group_spacing
-        passes = (delay + motion + longest >= -margin) & (delay - motion <= w.max_delay + margin)
-        paths.append(np.flatnonzero(passes))
-        offsets.append(np.full(paths[-1].size, offset))
-    return np.concatenate(paths), np.concatenate(offsets).astype(np.int64)
 
 
 def _element_delay(elements: np.ndarray, direction: np.ndarray, radius: np.ndarray) -> np.ndarray:

@@ -12,18 +12,16 @@ from __future__ import annotations
 
 import itertools
 import logging
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
-from isac_rt.hardware.front_end import IDEAL, Ends
+from isac_rt.kernels.signal_gridded import GRIDDED_ERROR
 from isac_rt.propagation.clutter.cells import Density, error_for
 from isac_rt.propagation.clutter.merging import apart_db, resolution_cell
 from isac_rt.propagation.clutter.rayleigh import RayleighClutter
@@ -38,7 +36,6 @@ from isac_rt.receive.sense import window_gain
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.results.metrics import decibels
 from isac_rt.results.records import Use
-from isac_rt.runtime import tracing_in_one_thread
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct, Method
 from isac_rt.simulation.plan import (
@@ -52,8 +49,6 @@ from isac_rt.simulation.plan import (
     next_slot_delay,
 )
 from isac_rt.simulation.setup import Frame, Setup
-from isac_rt.simulation.simulate import stage_seconds
-from isac_rt.track.self_calibration import SelfCalibration
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
@@ -63,8 +58,6 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 PILOT_FRAMES = 5
-FOLLOWED = 2
-"""Frames after each pilot frame whose tracing is timed: knots are passed now and then."""
 CHECK_RAYS = 300_000
 POWER_MARGIN = 10.0
 """Estimates of power over the largest of the pilot frames; 3.2 in amplitude."""
@@ -87,7 +80,6 @@ class Item:
     unit : "rad", "dB" (power over the noise of a cell), "dB of a cell's mean", "dB of noise
         and clutter", "relative", "paths/frame", "of the power radiated" or "of a path's amplitude"
     link : "TX->RX", or "all"
-    seconds : of processor time per frame, None where it has no time of its own
     """
 
     what: str
@@ -96,7 +88,6 @@ class Item:
     estimate: float | None = None
     unit: str = ""
     link: str = "all"
-    seconds: float | None = None
 
 
 def tracer_of(setup: Setup) -> RayTracer | None:
@@ -118,60 +109,30 @@ def _spread(values: Sequence[int], count: int) -> list[int]:
     return [values[i] for i in index]
 
 
-def make_plan(setup: Setup, receive: bool = False) -> dict[str, Any]:
-    """The plan of a run: decisions, one item per line, and the processor seconds of each stage.
-
-    Traces a few frames of the run, and those that follow, and makes their samples; with `receive`
-    receivers work on them too, the passive ones on the run's first frames.
-
-    Returns
-    -------
-    plan : ``seconds_per_frame`` are those of a frame by stage, ``seconds_once`` those of set-up and
-        what each stage takes beyond that when it is first used, ``seconds_of_run`` both for all
-        frames, without what loads the program and draws its results; what a machine does slowly or
-        quickly is in them as it was while the plan was made
-    """
-    with threadpool_limits(limits=1), tracing_in_one_thread():  # as in a run
-        return _make_plan(setup, receive)
-
-
-def _make_plan(setup: Setup, receive: bool) -> dict[str, Any]:
+def make_plan(setup: Setup) -> dict[str, Any]:
+    """The plan of a run: its decisions, and one item per line with the estimated error. Traces a
+    few frames."""
     plan = setup.plan
     frames = _spread(range(plan.timetable.frames), PILOT_FRAMES)
     uses: dict[Link, list[Use]] = {}
-    trace: list[float] = []
     light, late, short_lived = 0.0, 0.0, 0
-    begin = time.thread_time()
-    setup.frame(frames[0])
-    first = time.thread_time() - begin
     for frame in frames:
         _LOG.info("tracing frame %d, one of %d", frame, len(frames))
         poses, found = setup.find(frame)
         fastest = max(float(np.linalg.norm(pose.velocity)) for pose in poses.values())
         last = setup.frame_of(frame, poses, found)
-        trace += _seconds_after(setup, frame)
         for link, use in last.uses.items():
             uses.setdefault(link, []).append(use)
             paths = found[link].select(found[link].power > 0)
             light = max(light, flight_of_light(paths, setup.waveform, fastest))
             late = max(late, _late(setup, paths, last.noise_power(link)))
             short_lived += int((np.isfinite(paths.begin) | np.isfinite(paths.end)).sum())
-    _LOG.info("making the samples of %d frames", len(frames))
-    stages, beyond = stage_seconds(setup, frames, receive)
-    tracing = float(np.mean(trace))
-    seconds = {
-        "trace": tracing,
-        **{stage: sum(of.get(stage, 0.0) for of in stages.values()) for stage in beyond},
-    }
-    once = {"setup": setup.seconds.processor, "trace": max(first - tracing, 0.0), **beyond}
-    items = [_tracing_item(setup, frames, tracing)]
-    items += _scene_items(setup)
+    items = [_tracing_item(setup, frames), *_scene_items(setup)]
     for link, of_link in uses.items():
-        items += _link_items(setup, link, of_link, stages.get(link))
+        items += _link_items(setup, link, of_link)
     items += _standing_items(setup, light, late, short_lived / len(frames))
     items += [] if all(e.ideal for e in setup.front_ends.values()) else _hardware_items(last)
     items += _self_calibration_items(setup, last)
-    count = plan.timetable.frames
     return {
         **mechanisms(setup.scenario.propagation, setup.scenario.clutter),
         **decisions(plan),
@@ -179,11 +140,6 @@ def _make_plan(setup: Setup, receive: bool) -> dict[str, Any]:
         "coverage": asdict(setup.coverage),
         "pilot_frames": frames,
         "items": [asdict(item) for item in items],
-        "seconds_per_frame": seconds,
-        "seconds_once": once,
-        "seconds_of_run": {
-            stage: spent + count * seconds.get(stage, 0.0) for stage, spent in once.items()
-        },
     }
 
 
@@ -214,59 +170,28 @@ def _standing_items(setup: Setup, light: float, late: float, short_lived: float)
 
 
 def _hardware_items(frame: Frame) -> list[Item]:
-    """A line for each part of the hardware of each link that is not ideal: the seconds that it adds
-    to the samples by itself, and the noise of oscillators that is left out of the paths."""
+    """A line for each part of the hardware of each link that is not ideal, with the noise of
+    oscillators that is left out of the paths."""
     out = []
     for link in frame.paths:
         ends = frame.ends(link)
-        ideal = _synthesis_seconds(frame, link, Ends(IDEAL, (IDEAL,) * len(ends.senders)))
         for part in dict.fromkeys(p for one in (ends.receiver, *ends.senders) for p in one.parts):
-            seconds = max(_synthesis_seconds(frame, link, ends.only(part)) - ideal, 0.0)
             left, error = "nothing", None
             if part == "oscillator":
                 left = "noise within a chirp of weak paths"
                 error = decibels(frame.oscillator_noise_left_out(link))
             words, unit = part.replace("_", " "), "dB" if part == "oscillator" else ""
-            out.append(Item("hardware", words, left, error, unit, str(link), seconds))
+            out.append(Item("hardware", words, left, error, unit, str(link)))
     return out
 
 
 def _self_calibration_items(s: Setup, frame: Frame) -> list[Item]:
-    """A line for each link whose receiver calibrates itself: the seconds of a pass over the
-    samples, whatever it has learnt."""
+    """A line for each link whose receiver calibrates itself."""
     if s.scenario.receivers.self_calibration == "none":
         return []
-    out = []
-    for link in frame.paths:
-        cube = frame.samples(link)
-        one = SelfCalibration(s.waveform, s.antennas, link.passes)
-        begin = time.thread_time()
-        one.correct(cube, 0.0)
-        spent = time.thread_time() - begin
-        said = f"elements, chirp and clocks ({s.scenario.receivers.self_calibration})"
-        left = "coupling, patterns, oscillators"
-        out.append(Item("self-calibration", said, left, link=str(link), seconds=spent))
-    return out
-
-
-def _synthesis_seconds(frame: Frame, link: Link, ends: Ends) -> float:
-    """Processor seconds of a link's samples behind some hardware, the second time."""
-    for _ in range(2):
-        begin = time.thread_time()
-        frame.samples(link, ends)
-        spent = time.thread_time() - begin
-    return spent
-
-
-def _seconds_after(setup: Setup, frame: int) -> list[float]:
-    """Processor seconds, by the clock of `Stopwatch`, that tracing the frames after a made one
-    takes; of the last, itself again."""
-    out = []
-    for number in range(frame + 1, frame + 1 + FOLLOWED):
-        begin = time.thread_time()
-        setup.frame(min(number, setup.timetable.frames - 1))
-        out.append(time.thread_time() - begin)
-    return out
+    said = f"elements, chirp and clocks ({s.scenario.receivers.self_calibration})"
+    left = "coupling, patterns, oscillators"
+    return [Item("self-calibration", said, left, link=str(link)) for link in frame.paths]
 
 
 def missed_per_frame(setup: Setup, frames: Sequence[int]) -> float:
@@ -294,15 +219,15 @@ def _over(paths: PathSet, level: float, decibels: float) -> PathSet:
     return paths.select(paths.power > level * 10 ** (decibels / 10))
 
 
-def _tracing_item(setup: Setup, frames: Sequence[int], seconds: float) -> Item:
+def _tracing_item(setup: Setup, frames: Sequence[int]) -> Item:
     tracer, spacing = tracer_of(setup), setup.plan.max_untraced
     if tracer is None:
-        return Item("propagation", "closed forms", "the city", seconds=seconds)
+        return Item("propagation", "closed forms", "the city")
     where = f"every {spacing:g} m of flight" if spacing else "each frame"
     said = f"{setup.scenario.propagation.rays} rays for walls from {where}; images of each frame"
     missed = missed_per_frame(setup, frames)
     left = f"paths over {MATTERS_DB:g} dB over walls that no ray met"
-    return Item("tracing", said, left, missed, "paths/frame", seconds=seconds)
+    return Item("tracing", said, left, missed, "paths/frame")
 
 
 def _scene_items(setup: Setup) -> list[Item]:
@@ -344,11 +269,9 @@ def _mirrors_item(record: dict[str, dict[str, Any]] | None) -> Item:
     return Item(what, said, "weaker mirrors, more than one on a way", rest, "of the power radiated")
 
 
-def _link_items(
-    setup: Setup, link: Link, uses: list[Use], stages: dict[str, float] | None
-) -> list[Item]:
+def _link_items(setup: Setup, link: Link, uses: list[Use]) -> list[Item]:
     """Lines of one link."""
-    name, at, share = str(link), stages or {}, setup.plan.phase_share
+    name, share = str(link), setup.plan.phase_share
     mean = {
         key: float(np.mean([getattr(use, key) for use in uses]))
         for key in ("found", "unheard", "weak", "plane", "straight")
@@ -367,9 +290,8 @@ def _link_items(
 
     plane, straight = mean["plane"], mean["straight"]
     method = setup.plan.synthesis(int(num_kept))
-    error = 1e-6 if isinstance(method, Direct) else setup.plan.synthesis_error
-    seconds = at.get("synthesis")
-    out = [
+    error = 1e-6 if isinstance(method, Direct) else GRIDDED_ERROR
+    return [
         Item("paths", said, gone, left, "dB", name),
         Item(
             "wavefronts",
@@ -395,11 +317,8 @@ def _link_items(
             "rad",
             name,
         ),
-        Item("synthesis", method.name, "rounding of the grid", error, "relative", name, seconds),
+        Item("synthesis", method.name, "rounding of the grid", error, "relative", name),
     ]
-    if "receive" in at:
-        out.append(Item("reception", "all", link=name, seconds=at["receive"]))
-    return out
 
 
 def check(setup: Setup, frames: int = 4) -> dict[str, Any]:

@@ -41,25 +41,21 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.jit import jit
+from isac_rt.kernels.signal_gridded import GRIDDED_ERROR
 from isac_rt.propagation.clutter.cells import Density, error_for
 from isac_rt.propagation.model import Census
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.settings import Clutter, Propagation
 from isac_rt.results.records import Use
-from isac_rt.signal.choice import CostModel
-from isac_rt.signal.gridded import GRIDDED_ERROR
-from isac_rt.signal.methods import Auto, Direct, Gridded, Method
+from isac_rt.signal.methods import Auto, Direct, Method
 from isac_rt.signal.settings import Accuracy
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Swarm
 
-FASTEST_UNTRACED_M = 4.0
-"""Flight between knots under the preset fastest."""
 MATTERS_DB = -10.0
 """Paths over this count as missed [dB over the noise of a cell]."""
 COUNTS_DB = -40.0
 """Paths over this show what share is missed [dB over the noise of a cell]."""
-FASTEST_WEAKEST_DB = 0.0
 MOST_DIRECT = 2000
 """Paths up to which the preset everything takes the direct synthesis, whose time grows with them;
 beyond, `Auto`."""
@@ -79,7 +75,6 @@ class Plan:
     accuracy, propagation : what the scenario asks for
     antennas, timetable, swarm : of the run
     amplitude : sqrt(transmit power) of an antenna [sqrt(W)]
-    costs : what the methods of synthesis are taken to cost
     """
 
     accuracy: Accuracy
@@ -88,7 +83,6 @@ class Plan:
     timetable: Timetable
     swarm: Swarm
     amplitude: float
-    costs: CostModel
 
     @property
     def waveform(self) -> Waveform:
@@ -101,42 +95,27 @@ class Plan:
     @property
     def phase_share(self) -> float:
         """Most that either approximation may turn a phase [rad]."""
-        return {"everything": 0.0, "fastest": np.inf}.get(
-            self.preset, self.accuracy.max_phase_error_rad / 2
-        )
+        return 0.0 if self.preset == "everything" else self.accuracy.max_phase_error_rad / 2
 
     @property
     def weakest(self) -> float:
         """Power that may be left out of a range cell over the noise of a cell (linear)."""
         if self.preset == "everything":
             return 0.0
-        db = self.propagation.weakest_path_db
-        return float(
-            10 ** (-(min(db, FASTEST_WEAKEST_DB) if self.preset == "fastest" else db) / 10)
-        )
+        return float(10 ** (-self.propagation.weakest_path_db / 10))
 
     @property
     def max_untraced(self) -> float:
         """Most flight of a terminal between two knots, places from which rays search for walls; 0:
         they search from each frame's own [m]."""
-        return {"everything": 0.0, "fastest": FASTEST_UNTRACED_M}.get(
-            self.preset, self.accuracy.max_untraced_m
-        )
+        return 0.0 if self.preset == "everything" else self.accuracy.max_untraced_m
 
     def synthesis(self, num_paths: int, noise_power: float = 0.0) -> Method:
         """Method of `isac_rt.signal.if_signal.if_signal` for a cube of so many paths, over noise of
         this power [W]."""
-        if self.preset == "fastest":
-            return Gridded()
         if self.preset == "everything" and num_paths <= MOST_DIRECT:
             return Direct()
-        return Auto(
-            noise_power=noise_power,
-            max_error=self.synthesis_error,
-            costs=self.costs,
-            decide_for=num_paths,
-            covered=self.covered,
-        )
+        return Auto(noise_power=noise_power, covered=self.covered)
 
     @property
     def covered(self) -> float:
@@ -144,11 +123,6 @@ class Plan:
         none."""
         db = self.accuracy.covered_error_db
         return 0.0 if db is None or self.preset != "budget" else float(10 ** (-db / 10))
-
-    @property
-    def synthesis_error(self) -> float:
-        """Relative RMS error that the samples may have."""
-        return GRIDDED_ERROR if self.preset == "fastest" else self.accuracy.synthesis_error
 
     def spread_frames(self) -> list[int]:
         """Frames that show how the run changes: as few as are a metre of flight apart, evenly, and
@@ -405,9 +379,8 @@ def decisions(plan: Plan) -> dict[str, Any]:
         "max_untraced_m": plan.max_untraced,
         "reach_m": None if everything else round(plan.reach, 3),
         "synthesis": plan.synthesis(0).name,
-        "synthesis_error": plan.synthesis_error,
+        "synthesis_error": GRIDDED_ERROR,
         "covered_error_db": plan.accuracy.covered_error_db if plan.covered else None,
-        "cost_model": plan.costs.record(),
     }
 
 

@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from isac_rt.access.connect import Connections
 from isac_rt.access.protocol import Clock, Network, establish
 from isac_rt.capture.calibrate import Calibration, ideal, load_calibration
-from isac_rt.document import ScenarioError
 from isac_rt.frame.antennas import Antennas, antennas_of
-from isac_rt.frame.cube import IFCube, RangeProfiles, ReceiveArray, Reference, Transmission
+from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.level import (
     LinkBudget,
     link_budget,
@@ -39,9 +38,7 @@ from isac_rt.receive.types import ExpectedClutter
 from isac_rt.results.provenance import path_content
 from isac_rt.results.records import Use
 from isac_rt.scenario.tree import Scenario
-from isac_rt.signal.choice import SHIPPED
-from isac_rt.signal.choice import read as read_costs
-from isac_rt.signal.if_signal import noisy_if_signal, range_profiles
+from isac_rt.signal.if_signal import noisy_if_signal
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.signal.received import noise_left_out, received
 from isac_rt.simulation.coverage import Coverage, coverage
@@ -148,19 +145,9 @@ class Frame:
             return received(s.waveform, arriving, *heard, ends, method, noise)
         return noisy_if_signal(s.waveform, arriving, *self._listening(link), method, noise)
 
-    def heard(self, link: tuple[str, str]) -> IFCube | RangeProfiles:
-        """What a link's receiver is given: samples, or with ``receivers.active_input: profiles`` at
-        the active terminal range profiles."""
-        link, s = Link(*link), self._setup
-        if not link.own or s.scenario.receivers.active_input == "samples":
-            return s.calibrated(self.samples(link))
-        return range_profiles(
-            s.waveform,
-            self._arriving(link),
-            *self._listening(link),
-            self.sent[link.tx].payload,
-            noise=self._noise(link),
-        )
+    def heard(self, link: tuple[str, str]) -> IFCube:
+        """The samples that a link's receiver is given, the board's errors taken out."""
+        return self._setup.calibrated(self.samples(link))
 
     def _arriving(self, link: Link) -> list[tuple[Transmission, PathSet]]:
         """What reaches a link's receiver, its own transmitter's first; antennas that send at once
@@ -561,16 +548,7 @@ def timetable_of(scenario: Scenario, waveform: Waveform, schedule: Schedule) -> 
 
 
 def plan_of(scenario: Scenario, antennas: Antennas, timetable: Timetable, swarm: Swarm) -> Plan:
-    """What a scenario asks to be modelled.
-
-    Raises
-    ------
-    ScenarioError  If the file of accuracy.cost_model is none.
-    """
-    try:
-        costs = read_costs(scenario.cost_model_path() or SHIPPED)
-    except ValueError as problem:
-        raise ScenarioError(f"accuracy.cost_model: {problem}") from None
+    """What a scenario asks to be modelled."""
     return Plan(
         scenario.accuracy,
         scenario.propagation,
@@ -578,7 +556,6 @@ def plan_of(scenario: Scenario, antennas: Antennas, timetable: Timetable, swarm:
         timetable,
         swarm,
         transmit_amplitude(scenario.noise),
-        costs,
     )
 
 

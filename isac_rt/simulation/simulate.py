@@ -5,21 +5,19 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import deepcopy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
-from itertools import chain
 from typing import Any, NamedTuple
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from isac_rt.access.fall_back import Schedules
 from isac_rt.access.feedback import exchange
-from isac_rt.frame.cube import IFCube, RangeProfiles
+from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
 from isac_rt.plain import plain, restored
 from isac_rt.receive.settings import Receivers
@@ -48,12 +46,6 @@ Progress = Callable[[int, int], None]
 Terminal = ActiveTerminal | PassiveTerminal
 Jobs = dict[Link, Future[list[Heard]]]
 Carried = dict[Link, Future[list[dict[str, Any]]]]
-
-
-MOST_EARLY = 16
-"""Frames in a row at the most that show what passive terminals take."""
-FILLING = 6
-"""Frames in which the pictures of terminals that cooperate go on to fill, once tracks are told."""
 
 
 def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = None) -> Terminal:
@@ -119,7 +111,7 @@ class _Observer:
     def hear(
         self,
         frame: Frame,
-        cube: IFCube | RangeProfiles,
+        cube: IFCube,
         maps: bool,
         told: Sequence[KnownBody] = (),
     ) -> Heard:
@@ -138,7 +130,6 @@ class _Observer:
                 cube, payload, own, when, clutter=clutter, mates=mates, told=told, maps=maps
             )
         else:
-            assert isinstance(cube, IFCube)  # profiles are for active terminals only
             modulated = timetable.modulated(frame.number)
             reception, tracks = self.terminal.step(
                 cube,
@@ -394,114 +385,6 @@ def summarise(
     return run.summary()
 
 
-def stage_seconds(
-    setup: Setup, frames: Sequence[int], receive: bool
-) -> tuple[dict[Link | None, dict[str, float]], dict[str, float]]:
-    """Processor seconds of synthesis and, if asked for, reception and scoring, as some frames of
-    the run show them.
-
-    Passive terminals read what they have acquired, so that they hear frames one after the other, of
-    a run that begins in the middle of the flight: there it shows more of what it is on average than
-    at its start. Active ones hear `frames` too. What is scored and told is that of the last two of
-    the frames in a row, when tracks are confirmed. Sets of receivers that are compared count.
-
-    Returns
-    -------
-    per_frame : by link and stage, for one frame of the run on average; None for what is of no link
-    once : by stage what the first frame takes beyond that: machine code and tables are loaded
-    """
-    timetable, count = setup.timetable, _first_frames(setup.scenario) if receive else 0
-    begins = (timetable.frames - count) // 2
-    midway = replace(setup, timetable=replace(timetable, begins=begins))
-    in_a_row, sets = range(begins, begins + count), _standard(midway)
-    first: dict[tuple[Link | None, str], float] = {}
-    spent: dict[tuple[Link | None, str], dict[bool, list[float]]] = {}
-    for i, number in enumerate([frames[0], *dict.fromkeys([*in_a_row, *frames])]):
-        fresh, whole = not i or number not in in_a_row, receive and (not i or number in in_a_row)
-        of_run = setup if fresh else midway
-        frame = of_run.frame(number)
-        took = _seconds_of(frame, _standard(setup) if fresh else sets, whole, receive)
-        if not i:
-            first = took
-            continue
-        if number in in_a_row[:-2]:
-            del took[None, "track"]
-        for of, seconds in took.items():
-            by_kind = spent.setdefault(of, {})
-            by_kind.setdefault(of_run.timetable.modulated(number), []).append(seconds)
-    per_frame: dict[Link | None, dict[str, float]] = {}
-    once: dict[str, float] = {}
-    heard = Counter(
-        (link, timetable.modulated(f))
-        for f in range(timetable.frames)
-        for link in (None, *timetable.links(f))
-    )
-    for (link, stage), by_kind in spent.items():
-        counts = [heard[link, kind] for kind in (False, True)]
-        each = [
-            float(np.mean(by_kind.get(kind) or [*chain(*by_kind.values())]))
-            for kind in (False, True)
-        ]
-        per_frame.setdefault(link, {})[stage] = float(np.dot(counts, each)) / timetable.frames
-        mean = float(np.average(each, weights=counts))
-        beyond = max(first.get((link, stage), 0.0) - mean, 0.0)
-        once[stage] = once.get(stage, 0.0) + beyond
-    return per_frame, once
-
-
-def _first_frames(scenario: Scenario) -> int:
-    """How many frames it takes until data are read and active terminals' tracks are told of, and
-    where terminals cooperate until their pictures show most of what they will."""
-    acquired = scenario.modulation.acquisition_frames + 2
-    confirmed = scenario.tracking.confirm_hits * scenario.receivers.active_every_frames + 4
-    filled = confirmed + FILLING * (scenario.cooperation != "none")
-    return min(max(acquired, filled), MOST_EARLY, scenario.frames)
-
-
-def _seconds_of(
-    frame: Frame, sets: Sequence[_Listeners], whole: bool, receive: bool
-) -> dict[tuple[Link | None, str], float]:
-    """Processor seconds of a frame by link and stage, heard by active terminals if they `receive`,
-    as a `whole` by all, and then scored."""
-    out: dict[tuple[Link | None, str], float] = {}
-
-    def count(link: Link | None, stage: str, begun: float) -> None:
-        out[link, stage] = time.thread_time() - begun
-
-    heard: list[dict[Link, Heard]] = [{} for _ in sets]
-    for link in sets[0].recorder.timetable.links(frame.number):
-        begun = time.thread_time()
-        cube = _shared(frame.heard(link))
-        count(link, "synthesis", begun)
-        if whole or (receive and link.own):
-            begun = time.thread_time()
-            for by_link, one in zip(heard, sets, strict=True):
-                by_link[link] = one.observers[link].hear(frame, cube, False)
-            count(link, "receive", begun)
-    if whole:
-        begun = time.thread_time()
-        for by_link, one in zip(heard, sets, strict=True):
-            one.record(frame, by_link, False)
-        count(None, "track", begun)
-    return out
-
-
-def _shared(heard: IFCube | RangeProfiles) -> IFCube | RangeProfiles:
-    """What a link's receivers of all sets are given."""
-    return heard.shared() if isinstance(heard, IFCube) else heard
-
-
-def _standard(setup: Setup) -> list[_Listeners]:
-    """The scenario's own receivers and those compared, before their first frame."""
-    return [
-        _Listeners.of(setup, partial(standard_terminal, setup, settings=one), settings)
-        for one, settings in [
-            (None, setup.scenario.receivers),
-            *((one, one.receivers) for one in setup.scenario.compare.values()),
-        ]
-    ]
-
-
 class _AtWork(NamedTuple):
     """A frame whose receivers are at work, and if it is to be kept what each carries over right
     after it; what is not there is what it carries once all are done."""
@@ -624,7 +507,7 @@ class _Run:
         ends.
         """
         with self.stopwatch.stage("synthesis"):
-            cube = _shared(frame.heard(link))
+            cube = frame.heard(link).shared()
         if before is not None:
             before.result()
         with self.stopwatch.stage("receive"):

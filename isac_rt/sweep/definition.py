@@ -282,7 +282,6 @@ def ground_by(tree: dict[str, Any], files: Callable[[str, str | None], str]) -> 
         "program": program_fingerprint(),
         "versions": json.dumps(versions()),
         "city": files(json.dumps(city), None) if city else "",
-        "cost model": files("", (tree.get("accuracy") or {}).get("cost_model")),
         "calibration": files("", (tree.get("radio") or {}).get("calibration")),
     }
 
@@ -349,13 +348,13 @@ def files_under(folder: Path) -> Callable[[str, str | None], str]:
     return lru_cache(maxsize=64)(partial(files_digest, folder))
 
 
-def files_digest(folder: Path, city: str, costs: str | None) -> str:
+def files_digest(folder: Path, city: str, board: str | None) -> str:
     """Digest of the files of a city, as JSON, or of another file; "" where one is missing: the
     point's own check says so."""
     try:
         if city:
             return city_digest(City.model_construct(**json.loads(city)), folder)
-        return "" if costs is None else file_digest(folder / costs)
+        return "" if board is None else file_digest(folder / board)
     except (CityError, OSError):
         return ""
 

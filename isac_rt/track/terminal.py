@@ -15,7 +15,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.frame.cube import IFCube, RangeProfiles
+from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.waveform import Waveform
 from isac_rt.plain import Stateful
@@ -113,7 +113,7 @@ class ActiveTerminal(Stateful):
 
     def step(
         self,
-        cube: IFCube | RangeProfiles,
+        cube: IFCube,
         payload: Payload,
         own_pose: Pose,
         time: float,
@@ -132,8 +132,7 @@ class ActiveTerminal(Stateful):
         mates : poses that other terminals report, for its calibration
         told : bodies that others report
         """
-        if isinstance(cube, IFCube):
-            cube = self.equipment.hardware.correct(cube, time)
+        cube = self.equipment.hardware.correct(cube, time)
         before = self.state.correction
         if clutter is not None and before is not None:
             clutter = before.apply(clutter)
@@ -152,7 +151,7 @@ class ActiveTerminal(Stateful):
 
     def receive(
         self,
-        cube: IFCube | RangeProfiles,
+        cube: IFCube,
         payload: Payload,
         clutter: ExpectedClutter | None,
         maps: bool,

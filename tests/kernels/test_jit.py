@@ -138,8 +138,8 @@ kept.rebuild = lambda self, target, box: rebuild(self, target, *box)
 @pytest.mark.parametrize(
     ("module", "file"),
     [
-        ("signal.noise", "signal/noise.py"),
-        ("signal.gridded", "kernels/vector.py"),
+        ("kernels.signal_noise", "kernels/signal_noise.py"),
+        ("kernels.signal_gridded", "kernels/vector.py"),
         ("receive.transform", "kernels/fourier.py"),
         ("propagation.clutter.two_bounces", "propagation/clutter/field.py"),
     ],

@@ -12,13 +12,13 @@ from truths.stage import FEW, SMALL
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.kernels.signal_gridded import GRIDDED_ERROR
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Prediction
 from isac_rt.scenario.tree import Scenario
-from isac_rt.signal.gridded import GRIDDED_ERROR
 from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, Method
 
 C = SPEED_OF_LIGHT

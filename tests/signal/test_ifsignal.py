@@ -14,9 +14,9 @@ from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.kernels.signal_gridded import GRIDDED_ERROR
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.signal.exact import exact
-from isac_rt.signal.gridded import GRIDDED_ERROR
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct, Exact, Gridded
 from isac_rt.signal.tones import tones_of

@@ -10,9 +10,10 @@ from scipy import stats
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import Waveform
+from isac_rt.kernels.signal_noise import random_words
 from isac_rt.randomness import seed_sequence
 from isac_rt.signal.if_signal import add_noise
-from isac_rt.signal.noise import add_white_noise, random_words
+from isac_rt.signal.noise import add_white_noise
 
 COUNT = 1 << 20
 SIGMAS = 5  # statistical: a false failure in 1.7 million

@@ -9,14 +9,13 @@ import pytest
 from test_ifsignal import SMALL, START, antennas, paths, pose, sender
 
 from isac_rt.frame.cube import ReceiveArray, Reference
+from isac_rt.hardware import settings as scenario
 from isac_rt.hardware.channels import elements_of
 from isac_rt.hardware.converter import converter_of
 from isac_rt.hardware.front_end import IDEAL, Ends, FrontEnd
 from isac_rt.hardware.oscillator import Mask, Oscillator, spread
 from isac_rt.hardware.sweep import Ramp, response_of, short_read
 from isac_rt.propagation.pathset import PathKind
-from isac_rt.scenario import front_end as scenario
-from isac_rt.signal.gridded import ACCURATE
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Direct, Exact, Gridded
 from isac_rt.signal.noise import WhiteNoise
@@ -148,7 +147,7 @@ def test_elements_reach_every_method():
     ends = Ends(end, (end,))
     truth, *fast = (
         received(W, links, ear, Reference(START), ends, method, SILENT).samples
-        for method in (Exact(), Direct(), Gridded(ACCURATE))
+        for method in (Exact(), Direct(), Gridded())
     )
     assert error(fast[0], truth) < 1e-6
     assert error(fast[1], truth) < 1e-4  # 60 m/s of delay rate in a short chirp, as in `Gridded`

@@ -17,7 +17,7 @@ from isac_rt.randomness import generator
 from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.exact import filter_gain
-from isac_rt.signal.tones import sources
+from isac_rt.signal.tones import Tones as SynthesisTones
 from isac_rt.simulation.plan import (
     Plan,
     faintest,
@@ -293,7 +293,7 @@ def test_what_is_out_of_reach_is_what_the_synthesis_cannot_hear():
         delay = late
         symbol_delay = np.array([0.0, w.max_delay / 2])
 
-    heard = np.unique(sources(w, Tones)[0])
+    heard = np.unique(SynthesisTones.sources(Tones, w)[0])
     assert set(kept.delay) == set(late[heard])
     assert use.unheard == 60 - heard.size
 
@@ -326,7 +326,7 @@ def test_approximations_go_where_their_bounds_allow_and_nowhere_else():
     assert use.plane_error <= 0.0155 >= use.straight_error
 
 
-def test_everything_leaves_nothing_out_and_fastest_does_what_it_can():
+def test_everything_leaves_nothing_out():
     """Planted bug: the preset everything with the budget's threshold for weak paths."""
     paths = some_paths(120, 6)
     for noise in (1e-30, 1e10):
@@ -337,15 +337,12 @@ def test_everything_leaves_nothing_out_and_fastest_does_what_it_can():
         assert np.array_equal(kept.rx_radius, paths.rx_radius)
         assert np.array_equal(kept.delay_accel, paths.delay_accel)
         assert use.left_out == use.plane_error == use.straight_error == 0
-    kept, _ = plan_of("paper_swarm_consistent.yaml", "accuracy.preset=fastest").apply(paths, 1e-30)
-    assert np.isinf(kept.tx_radius).all()
-    assert not kept.delay_accel.any()
 
 
 @pytest.mark.sionna
 def test_knots_lie_as_far_apart_as_the_plan_says():
     """Along waypoints no terminal flies farther between two knots than the limit, nor much less;
-    the presets have limits of their own. Planted bug: the flight's own spacing."""
+    the preset everything has none. Planted bug: the flight's own spacing."""
     from isac_rt.propagation.clutter.sight import Flight
 
     plan = plan_of("munich_swarm.yaml", "accuracy.max_untraced_m=1.7")
@@ -354,6 +351,4 @@ def test_knots_lie_as_far_apart_as_the_plan_says():
         flight = Flight(plan.swarm.trajectories[name], plan.swarm.duration, np.zeros(3), 1.7)
         apart = np.linalg.norm(np.diff(flight.knots, axis=0), axis=1)
         assert 1.5 < apart.min() and apart.max() <= 1.7
-    limits = {"everything": 0.0, "fastest": 4.0}
-    for preset, limit in limits.items():
-        assert plan_of("munich_swarm.yaml", f"accuracy.preset={preset}").max_untraced == limit
+    assert plan_of("munich_swarm.yaml", "accuracy.preset=everything").max_untraced == 0.0

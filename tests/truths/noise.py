@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
+from isac_rt.kernels.signal_noise import random_words
 from isac_rt.randomness import seed_sequence
-from isac_rt.signal.noise import add_white_noise, random_words
+from isac_rt.signal.noise import add_white_noise
 from truths.case import case
 
 

@@ -13,10 +13,10 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.payload import demodulate_bits, modulate, running_phases, unmodulated
 from isac_rt.frame.schedule import is_latin, pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.kernels.signal_gridded import GRIDDED_ERROR
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.receive.known import Known
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.signal.gridded import GRIDDED_ERROR
 from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, Method
 from reproduce.waves import waves
 from truths import stage, truths

@@ -16,13 +16,13 @@ exp(-j 2 pi F D).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.fourier import ROW
 from isac_rt.kernels.jit import jit
+from isac_rt.kernels.signal_direct import passed
 from isac_rt.kernels.vector import (
     LANES,
     PART,
@@ -36,8 +36,6 @@ from isac_rt.kernels.vector import (
     store,
     unset,
 )
-from isac_rt.signal.direct import passed
-from isac_rt.signal.tones import Tones
 
 LINES = 8
 """Lines to a step of the grid."""
@@ -222,19 +220,19 @@ def batches(antenna: np.ndarray, slots: int) -> Batches:
     return Batches(order, np.array(rows, np.int64).reshape(-1, 3))
 
 
-def part_slots(waveform: Waveform, rate: np.ndarray, size: int) -> int:
+def part_slots(waveform: Any, rate: np.ndarray, size: int) -> int:
     """Slots of a part of the frame, in which paths move by no more than `MOVED`: whole batches, one
     at least."""
     moved = float(np.abs(rate).max(initial=0.0)) * waveform.slot_duration * _lines(waveform, size)
     return TOGETHER * max(int(MOVED / max(moved * TOGETHER, 1e-3)), 1)
 
 
-def _lines(waveform: Waveform, size: int) -> float:
+def _lines(waveform: Any, size: int) -> float:
     """Lines by which a delay of a second moves a path."""
     return waveform.slope * waveform.sample_interval * size * LINES
 
 
-def covered_error(waveform: Waveform, tones: Tones, size: int) -> np.ndarray:
+def covered_error(waveform: Any, tones: Any, size: int) -> np.ndarray:
     """(K,) bound of the relative RMS error over a frame of paths that noise covers, of what the
     receiver's filter would let through whole.
 
@@ -264,15 +262,7 @@ def covered_error(waveform: Waveform, tones: Tones, size: int) -> np.ndarray:
     )
 
 
-def summed_share(waveform: Waveform, tones: Tones, size: int) -> float:
-    """Chirps for which sums are made over those that there are: some of the few that share a sum
-    are missing where an element sends seldom."""
-    slots = part_slots(waveform, tones.rate, size)
-    count = batches(tones.antenna[0], slots).parts[:, 1]
-    return float((-(-count // _ACROSS) * _ACROSS).sum() / count.sum())
-
-
-def _apart(waveform: Waveform, order: np.ndarray, parts: np.ndarray) -> float:
+def _apart(waveform: Any, order: np.ndarray, parts: np.ndarray) -> float:
     """RMS of the time from the middle of the chirps that have the same shares [s]."""
     w = waveform
     place = np.concatenate([np.arange(count) for count in parts[:, 1]])
@@ -285,8 +275,8 @@ def _apart(waveform: Waveform, order: np.ndarray, parts: np.ndarray) -> float:
 
 
 def covered_paths(
-    waveform: Waveform,
-    tones: Tones,
+    waveform: Any,
+    tones: Any,
     sources: tuple[np.ndarray, np.ndarray],
     slots: int,
     size: int,

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels.jit import jit
 from isac_rt.kernels.vector import (
     LANES,
@@ -20,7 +19,6 @@ from isac_rt.kernels.vector import (
     zip_high,
     zip_low,
 )
-from isac_rt.signal.tones import Tones, sources
 
 
 class Numbers(NamedTuple):
@@ -46,7 +44,7 @@ class Numbers(NamedTuple):
     transition: float
 
 
-def numbers(waveform: Waveform) -> Numbers:
+def numbers(waveform: Any) -> Numbers:
     """The numbers of a waveform."""
     w = waveform
     middle = w.fast_time[w.num_samples // 2]
@@ -174,11 +172,11 @@ class OneByOne(NamedTuple):
 
     path: np.ndarray
     offset: np.ndarray
-    tones: Tones
+    tones: Any
     room: _Room
 
 
-def one_by_one(waveform: Waveform, tones: Tones) -> OneByOne:
+def one_by_one(waveform: Any, tones: Any) -> OneByOne:
     """All that is heard of some tones, for the kernels."""
     lanes = np.arange(LANES)
     places = np.concatenate([lanes, lanes * LANES]) + (LANES - 1) / 2 * np.repeat(
@@ -186,7 +184,7 @@ def one_by_one(waveform: Waveform, tones: Tones) -> OneByOne:
     )
     blocks = -(-waveform.num_samples // LANES)
     room = _Room(aligned(2 * LANES * blocks), aligned(4 * LANES), aligned(2 * LANES), places)
-    return OneByOne(*sources(waveform, tones), tones, room)
+    return OneByOne(*tones.sources(waveform), tones, room)
 
 
 @jit(fast=True, borrows=True)
@@ -236,8 +234,8 @@ def _direct(out, shape, w, alone, fresh, turn):
 
 def add_direct(
     samples: np.ndarray,
-    waveform: Waveform,
-    tones: Tones,
+    waveform: Any,
+    tones: Any,
     *,
     fresh: bool = False,
     turn: np.ndarray | None = None,
