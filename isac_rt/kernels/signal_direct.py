@@ -184,7 +184,8 @@ def one_by_one(waveform: Any, tones: Any) -> OneByOne:
     )
     blocks = -(-waveform.num_samples // LANES)
     room = _Room(aligned(2 * LANES * blocks), aligned(4 * LANES), aligned(2 * LANES), places)
-    return OneByOne(*tones.sources(waveform), tones, room)
+    path, offset = tones.sources(waveform)
+    return OneByOne(path, offset, tones, room)
 
 
 @jit(fast=True, borrows=True)

@@ -536,7 +536,7 @@ def make_gridded(
     tones: Any,
     faint: np.ndarray,
     alone: Any,
-    noise: tuple[float, Any, Any] = (0.0, np.uint32(0), np.uint32(0)),
+    noise: tuple[Any, Any, Any] = (np.float32(0), np.uint32(0), np.uint32(0)),
 ) -> None:
     """Make the samples of many weak paths; relative RMS error below `GRIDDED_ERROR`.
 

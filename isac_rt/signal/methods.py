@@ -15,7 +15,7 @@ from isac_rt.kernels.signal_covered import covered_error
 from isac_rt.kernels.signal_gridded import GRIDDED_ERROR, OVERSAMPLING, WIDTH, grid_size
 from isac_rt.kernels.vector import LANES, new_memory
 from isac_rt.propagation.clutter.merging import resolution_cell
-from isac_rt.signal.exact import exact
+from isac_rt.signal.exact import exact, filter_gain
 from isac_rt.signal.noise import SILENCE, WhiteNoise
 from isac_rt.signal.separable import separable
 from isac_rt.signal.tones import Tones
@@ -197,8 +197,36 @@ def add_up(
     faint: np.ndarray,
 ) -> None:
     """Write the sum of all tones, and noise, to samples (M, L_rx, P, N); `alone` and `faint` say
-    how fast methods make each path (K,)."""
-    samples[:] = exact(waveform, tones)
+    how fast methods make each path (K,).
+
+    The phase f_c tau + alpha tau (u - tau/2) of `exact` goes to second order about the middle of
+    each chirp. Samples n = a + b are the product of a coarse and a fine tone, times
+    1 + j 4 pi c a b for the quadratic term c.
+    """
+    w, t, half = waveform, tones, waveform.num_samples // 2
+    ts, u, a, b = w.sample_interval, w.fast_time[half], np.arange(-half, half, 32), np.arange(32)
+    samples[:] = 0
+    for m, p, source in np.ndindex(w.num_groups, w.num_chirps, w.num_groups):
+        time = w.chirp_time[m, p] + u - w.frame_duration / 2
+        rate, symbol = t.rate + t.accel * time, t.symbol_delay[t.link, source, p]
+        base = t.delay + (rate + t.rate) / 2 * time + symbol - (m - source) * w.group_spacing
+        weight = t.factor * t.send[t.link, source, p] * filter_gain(w, w.slope * base)
+        k = np.flatnonzero(weight * ((t.begin <= time) & (time < t.end)))
+        tx, rho, accel = t.antenna[t.link[k], source, p], rate[k], t.accel[k]
+        weight = weight[k] * (t.tx_gain[k, tx] if t.tx_gain.size else 1.0)
+        for rx in range(samples.shape[1] if k.size else 0):
+            joint = t.cross[t.cross_row[k], tx, rx]
+            tau = base[k] + t.tx_delay[k, tx] + t.rx_delay[k, rx] + joint
+            carrier = w.carrier_frequency + w.slope * (u - tau)
+            phase = w.carrier_frequency * tau + w.slope * tau * (u - tau / 2)
+            step = (carrier * rho + w.slope * tau) * ts
+            bend = (carrier * accel / 2 + w.slope * rho * (1 - rho / 2)) * ts**2
+            strength = weight * (t.rx_gain[k, rx] if t.rx_gain.size else 1.0)
+            coarse = np.exp(2j * np.pi * (phase % 1 + np.outer(a, step) + np.outer(a**2, bend)))
+            fine = np.exp(2j * np.pi * (np.outer(step, b) + np.outer(bend, b**2)))
+            coarse *= strength
+            both = coarse @ fine + (4j * np.pi * a[:, None] * bend * coarse) @ (b * fine)
+            samples[m, rx, p] += both.ravel()[: w.num_samples]
     noise.add_to(samples)
 
 
