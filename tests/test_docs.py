@@ -118,7 +118,6 @@ ELSEWHERE = {
     "targets.UAV.bound_p90",
     "targets.UAV.losses",
     "wall",
-    "cost_model",
     "links.LINK.kept_per_frame",
     "merged",
     "blocks",

@@ -153,7 +153,8 @@ class Chance:
         beat = float(w.beat_cells(paths.delay[own], paths.delay_rate[own], 0.0))
         doppler = places.velocity[own] / places.cells[1]
         off_grid = float(
-            hann_response(beat - round(beat)) * hann_response(doppler - round(doppler))
+            hann_response(np.array(beat - round(beat)))
+            * hann_response(np.array(doppler - round(doppler)))
         )
         mine = power[own]
         diffuse = paths.kind == PathKind.DIFFUSE

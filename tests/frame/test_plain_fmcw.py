@@ -127,7 +127,6 @@ def test_all_antennas_send_in_every_slot():
         ("radio.mode=isac", "no meaning with mode isac"),
         ("swarm.T.role=passive", "no passive terminals"),
         ("access.establish=true", "no links between terminals"),
-        ("receivers.active_input=profiles", "use samples"),
         ("receivers.velocity_method=pursuit", "not made for mode fmcw with scheme tdm"),
         ("radio.chirps_per_frame=50", "not a multiple"),
     ],

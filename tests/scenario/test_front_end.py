@@ -63,13 +63,10 @@ def test_elements_are_those_of_the_array_that_is_stated(rx, count):
         Scenario(swarm=SWARM, array=array, radio=stated)
 
 
-def test_targets_and_profiles_have_no_front_end():
-    """Planted bug: `_front_end_problems` not called."""
+def test_targets_have_no_front_end():
+    """Planted bug: `problems` of a UAV without those of its hardware."""
     with pytest.raises(ValidationError, match="no meaning for a target"):
         Scenario(swarm=SWARM | {"U": {"role": "target", "position_m": [9, 9, 9], "front_end": {}}})
-    noisy = {"front_end": {"oscillator": {"mask_dbc_hz": [[1e5, -80.0]]}}}
-    with pytest.raises(ValidationError, match="profiles are made past the samples"):
-        Scenario(swarm=SWARM, radio=noisy, receivers={"active_input": "profiles"})
 
 
 @pytest.mark.parametrize(
@@ -209,7 +206,6 @@ def test_what_is_no_value_is_one_message(part, said):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"receivers": {"active_input": "profiles"}}, "self-calibration corrects samples"),
         ({"radio": {"groups": 2}}, "as many groups as the 3 transmit antennas"),
     ],
 )

@@ -84,5 +84,3 @@ def test_files_that_are_no_calibration_are_refused(scene, tmp_path):
         CaptureError, match="4 receivers and 3 transmitters, the samples of 5 and 3"
     ):
         heard(scene, "radio.calibration=board.cal", "array.rx_x=4")
-    with pytest.raises(ScenarioError, match="a calibration corrects; take samples"):
-        irt.load(scene, ["radio.calibration=board.cal", "receivers.active_input=profiles"])

@@ -30,7 +30,6 @@ name: keyed
 frames: 5
 city: {source: mesh, file: house.obj}
 propagation: {model: ray_traced}
-accuracy: {cost_model: costs.json}
 radio: {calibration: board.cal}
 clutter: {model: field}
 receivers: {clutter_detector: cfar}
@@ -45,12 +44,10 @@ SWEEP = "scenario: s.yaml\nname: w\naxes: {snr: {key: noise.snr_db, values: [1]}
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    shipped = Path(provenance.__file__).parents[1] / "signal" / "cost_model.json"
     (tmp_path / "s.yaml").write_text(SCENE)
     (tmp_path / "w.yaml").write_text(SWEEP)
     (tmp_path / "house.obj").write_text(HOUSE)
     (tmp_path / "board.cal").write_text("of a board")
-    (tmp_path / "costs.json").write_bytes(shipped.read_bytes())
     return tmp_path
 
 
@@ -140,9 +137,9 @@ def test_the_program_is_every_source_and_table(tmp_path, monkeypatch):
     assert fingerprint() not in seen
 
 
-@pytest.mark.parametrize("name", ["house.obj", "costs.json", "board.cal"])
+@pytest.mark.parametrize("name", ["house.obj", "board.cal"])
 def test_keys_hold_the_files_that_a_scenario_names(folder, name):
-    """Paths and studies do not depend on the costs of synthesis and on the board. Planted bug:
+    """Paths and studies do not depend on the board. Planted bug:
     the digest kept from the last look."""
     before = keys(folder)
     text = (folder / name).read_text()
