@@ -21,8 +21,9 @@ from isac_rt.signal.separable import separable
 from isac_rt.signal.tones import Tones
 
 ERROR_AT_REST, ERROR_PER_SPEED = 5e-5, 1e-6
-"""Bound of the relative RMS error of a gridded path against the exact model, up to |u| = 0.87 and
-640 MHz: at rest, and more per m/s of c/2 times its delay rate (measured: docs/performance.md)."""
+"""Bound of the relative RMS error of a gridded path against the exact model, at rest, and more for
+each m/s of c/2 times its delay rate; up to direction cosines of 0.87 and 640 MHz (measured:
+tests/signal/test_gridding.py)."""
 GRID_PATHS = 150
 """Paths times receive elements whose tones take as long one by one as one grid of sixteen elements
 (100 to 250, by processor)."""
