@@ -172,9 +172,3 @@ def background(power, keep, sides, guard, half, least, out):
                         mean = (total[first + rows, p] - total[first, p]) / max(cells, 1)
                         level = max(level, mean)
             out[r, p] = level if level > -np.inf else np.inf
-
-
-@jit
-def lobe_bound(d: float) -> float:
-    """`isac_rt.receive.cfar.hann_envelope` of one distance of 0 or more."""
-    return 1.0 if d < 2 else 1.0 / (np.pi * d * (d * d - 1.0)) ** 2
