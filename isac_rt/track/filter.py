@@ -3,7 +3,7 @@ and birth."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -29,6 +29,8 @@ MANOEUVRE_TIME = 1.0
 """Correlation time of a body's acceleration [s]. Turns, braking and gusts hold theirs for half a
 second to some seconds; with PX4's default limits of 3 m/s^2 and 4 m/s^3 one needs 0.75 s."""
 _ITERATIONS = 10
+ROUNDING = 1e-12
+"""Of states of no deviation."""
 _POSITION = np.array([0, 2, 3])
 
 
@@ -217,14 +219,27 @@ def _updated(
     ambiguity: Ambiguity,
 ) -> Gaussian:
     """`update` by some `rows` of a measurement."""
+
+    def seen(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        off = wrapped(measurement - measure(x, own, transmitter), ambiguity)
+        return off[rows], jacobian(x, own, transmitter)[rows]
+
+    return conditioned(g, R[np.ix_(rows, rows)], seen)
+
+
+def conditioned(
+    g: Gaussian, R: np.ndarray, seen: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+) -> Gaussian:
+    """Condition states (S,) on a measurement (n,) of covariance R by the iterated EKF, in Joseph's
+    form: `seen` returns the measurement less what is expected at states, and the derivative (n, S)
+    of the latter."""
     mean, P = g
-    R, x, deviation = R[np.ix_(rows, rows)], mean, np.sqrt(np.diag(P))
+    x, enough = mean, 1e-3 * np.sqrt(np.diag(P)) + ROUNDING
     for _ in range(_ITERATIONS):
-        off = measurement - measure(x, own, transmitter)
-        y, H = wrapped(off, ambiguity)[rows], jacobian(x, own, transmitter)[rows]
+        off, H = seen(x)
         K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
-        new = mean + K @ (y - H @ (mean - x))
-        settled = np.all(np.abs(new - x) <= 1e-3 * deviation)
+        new = mean + K @ (off - H @ (mean - x))
+        settled = np.all(np.abs(new - x) <= enough)
         x = new
         if settled:
             break

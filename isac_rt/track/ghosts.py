@@ -26,7 +26,7 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.track.filter import Ambiguity, measure, wrapped
 from isac_rt.track.parts import Own, TrackRule
 from isac_rt.track.tracker import Track, Tracker, TrackSet, track_set
-from isac_rt.track.walls import Walls
+from isac_rt.track.walls import Walls, lengths
 from isac_rt.world.swarm import Pose
 
 DEVIATIONS = 3.0
@@ -271,7 +271,7 @@ def reflections(
     start, out = sender + here, []
     heard = [(face, measure(seen, own)) for face, seen in back]
     for first, image in [(-1, body), *_images(body, start, walls, reach)]:
-        way = np.array([*_apart(image, start), 0.0, 0.0])
+        way = np.append(lengths(image[None], start)[0], [0.0, 0.0])
         for last, seen in heard:
             order = (first >= 0) + (last >= 0)
             if order:
@@ -284,25 +284,8 @@ def _images(
 ) -> list[tuple[int, np.ndarray]]:
     """Mirror images (6,) of a body (6,) in the walls that show it to an end (6,) within reach [m],
     world coordinates, with the walls' faces."""
-    faces, normals, offsets = walls.mirrors
-    behind, before = normals @ body[:3] - offsets, normals @ end[:3] - offsets
-    apart2 = ((body[:3] - end[:3]) ** 2).sum() + 4 * behind * before  # to the image, squared
-    # else the wall stands between the two, or the image is too far
-    some = np.flatnonzero((behind * before > 0) & (apart2 < reach**2))
-    n, behind, before = normals[some], behind[some], before[some]
-    places = body[:3] - 2 * behind[:, None] * n
-    met = end[:3] + (places - end[:3]) * (before / (before + behind))[:, None]
-    boxed = walls.bounded(some, met, MEETING)
-    shown = np.flatnonzero(boxed)[walls.holds(some[boxed], met[boxed], MEETING)]
-    motions = body[3:] - 2 * (n @ body[3:])[:, None] * n
-    return [(int(faces[some[k]]), np.concatenate([places[k], motions[k]])) for k in shown]
-
-
-def _apart(body: np.ndarray, end: np.ndarray) -> tuple[float, float]:
-    """Distance of two bodies (6,) and its rate."""
-    offset, moved = body[:3] - end[:3], body[3:] - end[3:]
-    distance = float(np.linalg.norm(offset))
-    return distance, float(offset @ moved) / distance
+    mirrors, images = walls.images(body, end, reach, MEETING)
+    return [(int(walls.mirrors[0][k]), image) for k, image in zip(mirrors, images, strict=True)]
 
 
 def hidden_by(

@@ -21,7 +21,7 @@ from isac_rt.kernels.track_images import EDGE, LEAST_RANGE
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import Ambiguity, wrapped
 from isac_rt.track.parts import Own, TrackRule
-from isac_rt.track.walls import Walls
+from isac_rt.track.walls import Walls, lengths
 from isac_rt.world.swarm import Pose
 
 BESIDE_CELLS = 1.5
@@ -109,16 +109,9 @@ def _images(
 def _by_one(
     start: np.ndarray, end: np.ndarray, walls: Walls, near: np.ndarray, reach: float
 ) -> np.ndarray:
-    _, normals, offsets = walls.mirrors
-    n, p = normals[near], end[:3]
-    s, e = n @ start[:3] - offsets[near], n @ p - offsets[near]
-    some = s * e > 0
-    n, s, e, near = n[some], s[some], e[some], near[some]
-    image = start[:3] - 2 * s[:, None] * n
-    point = p + (image - p) * (e / (e + s))[:, None]
-    ways = _ways(image, start[3:] - 2 * (n @ start[3:])[:, None] * n, end)
-    on = walls.holds(near, point, EDGE) & (ways[:, 0] < reach) & (ways[:, 0] > 2 * LEAST_RANGE)
-    return ways[on]
+    _, images = walls.images(start, end, reach, EDGE, near)
+    found = lengths(images, end)
+    return found[found[:, 0] > 2 * LEAST_RANGE]
 
 
 def _by_two(
@@ -138,7 +131,7 @@ def _by_two(
     n, m, at_j = normals[i[kept]], normals[j[kept]], at_j[kept]
     turned = start[3:] - 2 * (n @ start[3:])[:, None] * n
     turned -= 2 * (turned * m).sum(axis=1)[:, None] * m
-    return _ways(at_j, turned, end)
+    return lengths(np.hstack([at_j, turned]), end)
 
 
 @twin_of(track_images.met)
@@ -180,10 +173,3 @@ def met(
         pairs.append(np.column_stack([np.full(on.sum(), i), j[on]]))
         places.append(np.stack([A, B, at_j], axis=1)[on])
     return np.concatenate(pairs), np.concatenate(places)
-
-
-def _ways(places: np.ndarray, motions: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Length and rate (K, 2) of straight ways from moving places (K, 3) to `end` (6,)."""
-    span = end[:3] - places
-    far = np.linalg.norm(span, axis=1)
-    return np.column_stack([far, (span * (end[3:] - motions)).sum(axis=1) / far])

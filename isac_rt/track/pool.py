@@ -23,6 +23,7 @@ from isac_rt.track.filter import (
     Ambiguity,
     Gaussian,
     birth,
+    conditioned,
     costs,
     expected,
     jacobian,
@@ -58,7 +59,6 @@ ERROR_TIME = 10.0
 minutes. A clock's error stays, and grows as looks state."""
 MOST_LATE = 0.5
 """Detections that come later count for nothing [s]."""
-_ROUNDS = 5
 _POSITION = np.array([0, 2, 3])
 
 
@@ -394,25 +394,19 @@ class PooledTracker(Stateful):
         z, std = view.look.z[q], np.fmax(view.look.std[q], STD_FLOOR)
         seen = np.flatnonzero(np.isfinite(z))
         R = np.diag(std[seen] ** 2)
-        x, P = pool.mean, pool.covariance
-        for _ in range(_ROUNDS):
+
+        def shown(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             own, sender = view.corrected(x)
             H = np.zeros((4, len(x)))
             H[:, at] = jacobian(x[at], own, sender)
             view.errors_into(H, x[at], own, sender)
-            H = H[seen]
-            off = wrapped(z - view.measured(x, x[at], own, sender), self._ambiguity(view))[seen]
-            K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
-            new = pool.mean + K @ (off - H @ (pool.mean - x))
-            settled = np.all(np.abs(new - x) <= 1e-3 * np.sqrt(np.diag(P)) + 1e-12)
-            x = new
-            if settled:
-                break
-        A = np.eye(len(x)) - K @ H
-        P = A @ P @ A.T + K @ R @ K.T
+            off = wrapped(z - view.measured(x, x[at], own, sender), self._ambiguity(view))
+            return off[seen], H[seen]
+
+        x, P = conditioned(Gaussian(pool.mean, pool.covariance), R, shown)
         body = self._fed(pool.bodies[k], view.look, q)
         bodies = (*pool.bodies[:k], body, *pool.bodies[k + 1 :])
-        return replace(pool, mean=x, covariance=(P + P.T) / 2, bodies=bodies)
+        return replace(pool, mean=x, covariance=P, bodies=bodies)
 
     def _fed(self, body: Body, look: Look, q: int) -> Body:
         """A body after one more detection: its track, and the earliest name that is known of it."""

@@ -90,6 +90,37 @@ class Walls:
         """(2, W, 3) lowest and highest corner of each mirror's faces, world coordinates."""
         return self._faces[2]
 
+    def images(
+        self,
+        body: np.ndarray,
+        end: np.ndarray,
+        reach: float,
+        edge: float,
+        among: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mirrors (K,) that show a body (6,) to an `end` (6,) within `reach` [m], and
+        its images in them (K, 6), positions and velocities in world coordinates.
+
+        Parameters
+        ----------
+        edge : how far off its faces a wave may meet a mirror [m]
+        among : numbers of the mirrors that are tried; None: all
+        """
+        _, normals, offsets = self.mirrors
+        tried = np.arange(len(normals)) if among is None else among
+        n = normals[tried]
+        behind, before = n @ body[:3] - offsets[tried], n @ end[:3] - offsets[tried]
+        apart2 = ((body[:3] - end[:3]) ** 2).sum() + 4 * behind * before  # to the image, squared
+        # else the wall stands between the two, or the image is too far
+        some = (behind * before > 0) & (apart2 < reach**2)
+        tried, n, behind, before = tried[some], n[some], behind[some], before[some]
+        places = body[:3] - 2 * behind[:, None] * n
+        met = end[:3] + (places - end[:3]) * (before / (before + behind))[:, None]
+        boxed = self.bounded(tried, met, edge)
+        shown = np.flatnonzero(boxed)[self.holds(tried[boxed], met[boxed], edge)]
+        motions = body[3:6] - 2 * (n @ body[3:6])[:, None] * n
+        return tried[shown], np.hstack([places, motions])[shown]
+
     def holds(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
         """Whether points (n, 3) in the planes of mirrors (n,) lie on one of their faces, or within
         `edge` of it."""
@@ -130,3 +161,11 @@ class Walls:
         return np.flatnonzero(
             (slope != 0) & (share > 0) & (share < 1) & np.logical_and.reduce(inside)
         )
+
+
+def lengths(bodies: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return length and its rate (K, 2) of straight paths from moving bodies (K, 6) to `end`
+    (6,)."""
+    span, moved = end[:3] - bodies[:, :3], end[3:6] - bodies[:, 3:6]
+    far = np.linalg.norm(span, axis=1)
+    return np.column_stack([far, (span * moved).sum(axis=1) / far])
