@@ -122,6 +122,21 @@ class MissingPackage(UserError, ModuleNotFoundError):
     """A package that only some of the program needs is not installed."""
 
 
+def needed(module: str, extra: str) -> Any:
+    """Import a module that one of this package's extras installs.
+
+    Raises
+    ------
+    MissingPackage  If it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as problem:
+        raise MissingPackage(
+            f"this needs the package {module}: pip install 'isac_rt[{extra}]'"
+        ) from problem
+
+
 class MachineProblem(UserError):
     """The machine will not do as it is: its disk, its memory, a library. The same may succeed at
     another time or place."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.runtime import needed
 from isac_rt.storage import write_whole
 from isac_rt.views.figures import KIND_COLOURS, colour_of, words
 from isac_rt.views.moving_scene import ROLE_SYMBOLS, city_traces, layout
@@ -41,6 +42,10 @@ def scene_3d(
     time : of the swarm and the paths [s]
     reach : how far beyond the swarm the city is drawn [m]
 
+    Raises
+    ------
+    isac_rt.runtime.MissingPackage  Without the package `plotly`.
+
     Examples
     --------
     >>> import isac_rt as irt
@@ -52,7 +57,7 @@ def scene_3d(
     >>> len(figure.data) > len(setup.swarm.uavs)
     True
     """
-    import plotly.graph_objects as go  # takes long to load
+    go = needed("plotly.graph_objects", "views")  # takes long to load
 
     figure = go.Figure()
     tracks = np.array([[pose.position for pose in swarm.poses(t).values()] for t in times])

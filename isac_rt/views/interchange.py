@@ -7,7 +7,6 @@ SigMF and Stone Soup are the extra ``interchange`` (`pip install isac_rt[interch
 from __future__ import annotations
 
 import datetime
-import importlib
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -23,14 +22,14 @@ from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.results.dataset import DIMENSIONLESS, PATHS, Column, stacked
 from isac_rt.results.files import write_dataset
 from isac_rt.results.records import KINDS
-from isac_rt.runtime import MissingPackage
+from isac_rt.runtime import needed
 from isac_rt.storage import write_whole
 
 if TYPE_CHECKING:
     import sionna.rt as rt
     from stonesoup.types.detection import Detection
 
-EXTRA = "pip install 'isac_rt[interchange]'"
+EXTRA = "interchange"
 
 
 def write_ledger(
@@ -102,7 +101,7 @@ def write_sigmf(cube: IFCube, file: str | Path, description: str = "") -> tuple[
     ------
     isac_rt.runtime.MissingPackage  Without the package `sigmf`.
     """
-    sigmf = _imported("sigmf")
+    sigmf = needed("sigmf", EXTRA)
     w, base = cube.waveform, Path(file)
     groups, antennas = cube.samples.shape[:2]
     data, meta = (
@@ -226,7 +225,7 @@ def stonesoup_detections(
     isac_rt.runtime.MissingPackage  Without the package `stonesoup`.
     KeyError  If there is no such observer.
     """
-    _imported("stonesoup")
+    needed("stonesoup", EXTRA)
     from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRangeRate
     from stonesoup.types.array import CovarianceMatrix, StateVector
     from stonesoup.types.detection import Detection
@@ -293,10 +292,3 @@ def _world_angles(
     return np.array([np.arcsin(d[2]), np.arctan2(d[1], d[0])]), jacobian @ np.diag(
         std**2
     ) @ jacobian.T
-
-
-def _imported(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as problem:
-        raise MissingPackage(f"this needs the package {name}: {EXTRA}") from problem

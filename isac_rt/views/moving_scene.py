@@ -16,6 +16,7 @@ import xarray as xr
 
 from isac_rt.results.dataset import fused_positions, tracked_states
 from isac_rt.results.swarm import SWARM
+from isac_rt.runtime import needed
 from isac_rt.views.export import path_lines
 from isac_rt.views.figures import KIND_COLOURS, colour_of, words
 from isac_rt.world.city.mesh import CityMesh
@@ -260,7 +261,13 @@ def _controls(dataset: xr.Dataset, steps: np.ndarray, names: list[str]) -> dict[
 
 
 def page_part(figure: Mapping[str, Any], name: str) -> str:
-    """HTML that shows a figure and fetches nothing: plotly's own script, then the figure."""
+    """Return HTML that shows a figure and fetches nothing: plotly's own script, then the figure.
+
+    Raises
+    ------
+    isac_rt.runtime.MissingPackage  Without the package `plotly`.
+    """
+    needed("plotly", "views")
     script = files("plotly").joinpath("package_data/plotly.min.js").read_text(encoding="utf-8")
     drawn = json.dumps(figure, separators=(",", ":")).replace("</", "<\\/")
     return (

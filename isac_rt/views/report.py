@@ -12,6 +12,7 @@ import jinja2
 import xarray as xr
 
 from isac_rt.results.recorder import Results
+from isac_rt.runtime import MissingPackage
 from isac_rt.storage import write_whole
 from isac_rt.views.moving_scene import MOST_LINES, moving_scene, page_part
 from isac_rt.views.tables import (
@@ -87,6 +88,16 @@ _CAPTIONS = {
 }
 
 
+def _scene(dataset: xr.Dataset, city: CityMesh | None) -> tuple[str, str]:
+    """The flight as a scene to turn about, and why there is none; empty where there is no city."""
+    if city is None or "track_state" not in dataset:
+        return "", ""
+    try:
+        return page_part(moving_scene(dataset, city), "scene"), ""
+    except MissingPackage as problem:
+        return "", str(problem)
+
+
 def wall_table(dataset: xr.Dataset, city: CityMesh) -> Table:
     """The surfaces of the city that most detections came from, as `walls` finds them."""
     found = walls(dataset, city).head(MOST_WALLS)
@@ -119,6 +130,7 @@ def write_report(
     isac_rt.storage.StorageError  If the folder cannot be written.
     """
     s, d, radio = results.summary, results.dataset, results.scenario.radio
+    scene, no_scene = _scene(d, city)
     materials = json.loads(d.attrs["materials"])
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
@@ -153,7 +165,8 @@ def write_report(
         paths=Table(
             ("Kind", "Paths"), [(k.replace("_", " "), number(v)) for k, v in s["paths"].items()]
         ),
-        scene=page_part(moving_scene(d, city), "scene") if city and "track_state" in d else None,
+        scene=scene,
+        no_scene=no_scene,
         lines=MOST_LINES,
         figures=_embedded(pictures),
         access=Table(("Stages before the data", "Outcome"), flat(s["access"] or {})),

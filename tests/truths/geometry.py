@@ -15,10 +15,11 @@ from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.legs.geometry import Legs, plane_of_each_face, straight, unfold
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.world.city import load_city
-from isac_rt.world.city.extrude import Finish, building
+from isac_rt.world.city.extrude import building
 from isac_rt.world.city.materials import MaterialUse
 from isac_rt.world.city.mesh import clean
 from isac_rt.world.city.place import LONLAT, Place, plane_about
+from isac_rt.world.city.prism import Finish
 from isac_rt.world.swarm import Pose, Trajectory
 from truths import stage, truths
 from truths.case import Errors, case, slow_traced, traced

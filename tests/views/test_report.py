@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import xarray as xr
 from fake_run import fake_run
 
 from isac_rt.propagation.pathset import PathKind
-from isac_rt.views.report import wall_table
+from isac_rt.views.report import wall_table, write_report
 from isac_rt.views.tables import (
     error_table,
     false_table,
@@ -136,3 +138,12 @@ def test_tables_fit_the_page(summary):
         cells = zip(found.columns, *found.rows, strict=True)
         width = sum(max(map(len, column)) * 7.5 + 22 for column in cells)
         assert width < 1200, table.__name__
+
+
+def test_without_plotly_the_report_says_what_to_install(monkeypatch, tmp_path):
+    """Planted bug: the exception let through, after a run that took hours."""
+    monkeypatch.setitem(sys.modules, "plotly", None)
+    city = load_city(City(source="canyon"), Path(), 77e9, (0.0, 0.0, 0.0))
+    page = write_report(fake_run(), tmp_path, [], city).read_text()
+    assert "pip install &#39;isac_rt[views]&#39;" in page
+    assert "Plotly.newPlot" not in page

@@ -13,8 +13,8 @@ import pytest
 import trimesh
 
 from isac_rt import scenario
-from isac_rt.world.city import CityError, CityMesh, load_city
-from isac_rt.world.city.extrude import Finish, building
+from isac_rt.world.city import CityError, CityMesh, load_city, parametric
+from isac_rt.world.city.extrude import building
 from isac_rt.world.city.materials import (
     KNOWN_MATERIALS,
     MaterialUse,
@@ -23,6 +23,8 @@ from isac_rt.world.city.materials import (
 )
 from isac_rt.world.city.mesh import Surface, clean, distance_to_triangles
 from isac_rt.world.city.place import is_lonlat
+from isac_rt.world.city.prism import Finish
+from isac_rt.world.settings import City
 
 F_C = 77e9
 ORIGIN = (0.0, 0.0, 0.0)
@@ -702,3 +704,20 @@ def test_no_city_is_free_space():
     assert city.plane_of_face.size == city.areas.size == 0
     assert city.normals.shape == (0, 3)
     assert city.origin.tolist() == [5.0, 6.0, 7.0]
+
+
+def test_a_box_of_a_canyon_is_the_prism_over_its_rectangle():
+    """Corner by corner as shapely triangulates it. Planted bug: the other diagonal."""
+    import shapely
+
+    city = City(source="canyon", block_size_m=17.3, street_length_m=51.9, street_width_m=13.7)
+    surfaces = parametric.canyon(city)
+    finish = Finish(surfaces[0].material, surfaces[1].material, surfaces[2].material)
+    for k in range(0, len(surfaces) - 1, 3):
+        low, high = surfaces[k].vertices.min(axis=0), surfaces[k].vertices.max(axis=0)
+        box = shapely.box(*low[:2], *high[:2])
+        for made, drawn in zip(
+            building(box, 0.0, high[2], finish, "box"), surfaces[k : k + 3], strict=True
+        ):
+            np.testing.assert_array_equal(made.vertices, drawn.vertices)
+            np.testing.assert_array_equal(made.faces, drawn.faces)

@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import mapbox_earcut
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from isac_rt.world.city.materials import CityError, MaterialUse
+from isac_rt.world.city.materials import CityError
 from isac_rt.world.city.mesh import Surface
+from isac_rt.world.city.prism import Finish, prism
 
 MAX_CORNERS = 10_000
 """Of one polygon: triangulation takes a time that grows with their square, 1 s here."""
 MAX_CROSSINGS = 100
 """Of one polygon with itself; GEOS repairs some 2000 in a second."""
-
-
-@dataclass(frozen=True)
-class Finish:
-    """What a building is made of."""
-
-    wall: MaterialUse
-    roof: MaterialUse
-    floor: MaterialUse
 
 
 def check_corners(count: int, what: str) -> None:
@@ -156,10 +147,6 @@ def building(
     )  # outer ring counter-clockwise, holes clockwise
     rings = [shapely.get_coordinates(r)[:-1] for r in (polygon.exterior, *polygon.interiors)]
     plan = np.concatenate(rings)
-    num = len(plan)
-    vertices = np.empty((2 * num, 3))
-    vertices[:num, :2], vertices[num:, :2] = plan, plan
-    vertices[:num, 2], vertices[num:, 2] = base, top
     cap = _cap(polygon, plan)
     covered = _turn(plan[cap]).sum() / 2
     if abs(covered - polygon.area) > 1e-6 * polygon.area:
@@ -167,18 +154,7 @@ def building(
             f"{what}: its roof cannot be triangulated ({covered:.6g} of {polygon.area:.6g} m2 "
             "covered); simplify the outline"
         )
-    lengths = np.array([len(ring) for ring in rings])
-    ends = np.cumsum(lengths)
-    here = np.arange(num)
-    after = here + 1
-    after[ends - 1] = ends - lengths  # rings close
-    halves = np.array([[here, after, after + num], [here, after + num, here + num]])
-    walls = halves.transpose(0, 2, 1).reshape(-1, 3)
-    return [
-        Surface(vertices, walls, finish.wall),
-        Surface(vertices, cap + num, finish.roof),
-        Surface(vertices, cap[:, ::-1], finish.floor),
-    ]
+    return prism(rings, cap, base, top, finish)
 
 
 SQUARE_SHARE = 0.85
@@ -282,29 +258,3 @@ def roofed(
         Surface(vertices, slopes, finish.roof),
         Surface(vertices, floor[:, ::-1], finish.floor),
     ]
-
-
-def ground(
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-    margin: float,
-    height: float,
-    material: MaterialUse,
-) -> Surface:
-    """A rectangle under everything, facing up.
-
-    Parameters
-    ----------
-    low, high : (2,) float64
-        Corners of what stands on it. [m]
-    margin : float
-        Added on each side. [m]
-    height : float
-        [m]
-    material : MaterialUse
-    """
-    (x_0, y_0), (x_1, y_1) = low - margin, high + margin
-    vertices = np.array(
-        [[x_0, y_0, height], [x_1, y_0, height], [x_1, y_1, height], [x_0, y_1, height]]
-    )
-    return Surface(vertices, np.array([[0, 1, 2], [0, 2, 3]]), material)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import shapely
 
 from isac_rt.randomness import splitmix64
 from isac_rt.world import settings
-from isac_rt.world.city.extrude import Finish, building, ground
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface
+from isac_rt.world.city.prism import Finish, ground, prism
+
+_BOX_CAP = np.array([[2, 3, 0], [0, 1, 2]])
+"""Triangles over the corners of a box from its south-east corner counter-clockwise."""
 
 
 def spread_fraction(i: int, j: int) -> float:
@@ -38,7 +40,8 @@ def _blocks(
     )
     surfaces: list[Surface] = []
     for x_0, y_0, x_1, y_1, height in boxes:
-        surfaces += building(shapely.box(x_0, y_0, x_1, y_1), 0.0, height, finish, "block")
+        corners = np.array([[x_1, y_0], [x_1, y_1], [x_0, y_1], [x_0, y_0]])
+        surfaces += prism([corners], _BOX_CAP, 0.0, height, finish)
     edges = np.array(boxes)
     low, high = edges[:, :2].min(axis=0), edges[:, 2:4].max(axis=0)
     return [*surfaces, ground(low, high, city.ground_margin_m, 0.0, finish.floor)]

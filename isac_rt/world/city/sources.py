@@ -6,12 +6,14 @@ import os
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from isac_rt.registry import CITY_SOURCES
 from isac_rt.world import settings
+from isac_rt.world.city.files import needs_extra
 from isac_rt.world.city.materials import CityError, resolve_materials
 from isac_rt.world.city.mesh import CityMesh, Surface, clean, empty_city
 from isac_rt.world.city.meshfiles import mesh_file, mesh_files
@@ -64,10 +66,8 @@ def city_files(city: settings.City | None, folder: Path) -> list[Path]:
         return [_path(city, folder)] if city.file else []
     path = _path(city, folder)
     if city.source == "footprints":
-        from isac_rt.world.city.tables import table_files
-
-        terrain = _terrain(city, folder)
-        return [*table_files(path), *([] if terrain is None else [terrain])]
+        tables, terrain = _map_reader("tables", path), _terrain(city, folder)
+        return [*tables.table_files(path), *([] if terrain is None else [terrain])]
     return mesh_files(path) if city.source == "mesh" else mitsuba_files(path)
 
 
@@ -89,9 +89,20 @@ class CityParts:
     place: Place | None = None
 
 
+def _map_reader(module: str, path: Path) -> Any:
+    """Import a module of this folder that needs shapely, pyproj and mapbox_earcut.
+
+    Raises
+    ------
+    CityError  If they are not installed.
+    """
+    needs_extra("pyproj", path.name, "maps")
+    return needs_extra(f"isac_rt.world.city.{module}", path.name, "maps")
+
+
 def canyon(city: settings.City, folder: Path) -> CityParts:
     """A street between two rows of buildings."""
-    from isac_rt.world.city import parametric  # shapely is loaded for cities that are extruded
+    from isac_rt.world.city import parametric
 
     return CityParts(city.name or "canyon", parametric.canyon(city))
 
@@ -105,10 +116,8 @@ def blocks(city: settings.City, folder: Path) -> CityParts:
 
 def footprints(city: settings.City, folder: Path) -> CityParts:
     """Buildings extruded from footprints or read as solids, on their terrain."""
-    from isac_rt.world.city import footprints
-
     path = _path(city, folder)
-    found = footprints.footprints(city, path, _terrain(city, folder))
+    found = _map_reader("footprints", path).footprints(city, path, _terrain(city, folder))
     return CityParts(city.name or path.name, *found)
 
 

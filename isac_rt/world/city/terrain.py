@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isac_rt.world.city.cityjson import BUILDING_TYPES, Body
-from isac_rt.world.city.extrude import ground
 from isac_rt.world.city.files import needs_extra, read_bytes
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface
 from isac_rt.world.city.place import Place
+from isac_rt.world.city.prism import ground
 
 FLAT_M = 5.0
 """Feet of nine of ten buildings within this are on flat ground: one plane reflects as a plane."""
