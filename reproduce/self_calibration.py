@@ -117,7 +117,7 @@ def _square(
     """Mean squared error of the cosines of a wave over their bounds, corrected by what is known."""
     u = rng.uniform(-0.5, 0.5, 2)
     wave = _wave(u, w, antennas, passes)
-    each = np.exp(one.gains.value[0] + 1j * one.gains.value[1])
+    each = np.exp(one.state.gains.value[0] + 1j * one.state.gains.value[1])
     known = (each[: antennas.num_tx, None] * each[antennas.num_tx :]).ravel()
     if passes == 1:
         known = np.tile(each, antennas.num_tx)
