@@ -79,6 +79,32 @@ class Registry:
         return name
 
 
+DETECTORS = Registry(
+    "detectors",
+    {
+        "cfar": "isac_rt.receive.chain:cfar_with",
+        "angle_doppler": "isac_rt.receive.clutter.angle_doppler:AngleDoppler",
+    },
+)
+"""Functions of the settings `Receivers` and an `Estimator` that return a `Detector`, for active
+terminals."""
+PASSIVE_DETECTORS = Registry(
+    "passive_detectors",
+    {
+        "cfar": "isac_rt.receive.chain:cfar_with",
+        "beams": "isac_rt.receive.clutter.bistatic:BeamSearch",
+    },
+)
+"""The same for passive terminals, whose detector is a `Cfar`."""
+SYMBOL_READERS = Registry(
+    "symbol_readers",
+    {
+        "powers": "isac_rt.receive.symbols.powers:ByPowers",
+        "beams": "isac_rt.receive.symbols.beams:ByBeams",
+    },
+)
+"""Functions of the DPSK order and of the least run of clutter cells (or None) that return a
+`ByPowers`."""
 PROPAGATION_MODELS = Registry(
     "propagation_models",
     {

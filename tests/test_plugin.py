@@ -30,6 +30,13 @@ name: s
 scenario: scenario.yaml
 axes: {snr_db: {key: noise.snr_db, values: [3, 13]}}
 """
+DATA = """\
+name: d
+scenario: scenario.yaml
+scenes: 2
+seed: 3
+keep: [tracks]
+"""
 
 
 @pytest.fixture
@@ -37,6 +44,7 @@ def isac_rt(tmp_path):
     """Run the command line where the example package is installed."""
     (tmp_path / "scenario.yaml").write_text(SCENARIO)
     (tmp_path / "sweep.yaml").write_text(SWEEP)
+    (tmp_path / "data.yaml").write_text(DATA)
     path = os.pathsep.join([str(HERE.parent), str(HERE / "plugin")])
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -75,6 +83,29 @@ def test_a_city_and_a_propagation_model_of_another_package(isac_rt, tmp_path):
     # noise alone changes the ratio; 10 dB SNR in some 10^6 samples
     assert power[0][both] / power[1][both] == pytest.approx(0.01, rel=0.02)
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["city"]["name"] == "wall"
+
+
+def test_detectors_and_a_symbol_reader_of_another_package(isac_rt, tmp_path):
+    """A detector that finds nothing, and a reader that is always wrong. Planted bug: the tables of
+    the chain asked first."""
+    parts = ("clutter_detector=far", "passive_detector=plain", "symbol_decision=late")
+    for name, changes in (("own", ()), ("theirs", parts)):
+        options = [word for change in changes for word in ("--set", f"receivers.{change}")]
+        power = ("--set", "propagation.model=free_space", "--set", "noise.snr_db=-25")
+        done = isac_rt("run", "scenario.yaml", "--out", name, *power, *options)
+        assert done.returncode == 0, done.stderr
+    links = [
+        json.loads((tmp_path / name / "summary.json").read_text())["links"]
+        for name in ("own", "theirs")
+    ]
+    assert links[0]["AT->PT1"]["ser_delay"] == 0 and links[1]["AT->PT1"]["ser_delay"] == 1
+    assert links[0]["AT->AT"]["hit_rate"] == 1 and links[1]["AT->AT"]["hit_rate"] == 0
+
+
+def test_a_data_set_over_parts_of_another_package(isac_rt):
+    """Planted bug: as for sweeps."""
+    done = isac_rt("dataset", "data.yaml", "--out", "data", "--workers", "2")
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_sweep_over_parts_of_another_package(isac_rt):

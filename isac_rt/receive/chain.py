@@ -1,6 +1,6 @@
 """Receivers as chains of values, each built once from the settings by a table.
 
-A new detector, estimator or symbol reader is one file and one line here.
+A new detector or symbol reader is one file and one line in `isac_rt.registry`.
 """
 
 from __future__ import annotations
@@ -10,8 +10,6 @@ from functools import partial
 
 import numpy as np
 
-from isac_rt.receive.clutter.angle_doppler import AngleDoppler
-from isac_rt.receive.clutter.bistatic import BeamSearch
 from isac_rt.receive.clutter.filter import ClutterFilter
 from isac_rt.receive.estimate import Estimator
 from isac_rt.receive.joint.moments import Moments
@@ -21,9 +19,9 @@ from isac_rt.receive.omp import Omp
 from isac_rt.receive.pursuit import BySchedule, Pursuit
 from isac_rt.receive.sense import Cfar, Detector
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.symbols.beams import ByBeams
 from isac_rt.receive.symbols.powers import ByPowers
 from isac_rt.receive.types import Detections
+from isac_rt.registry import DETECTORS, PASSIVE_DETECTORS, SYMBOL_READERS
 
 Refiner = Callable[[Moments, Detections], tuple[Detections, np.ndarray]]
 """From the sums of samples and near estimates to better ones and the paths' powers."""
@@ -42,12 +40,6 @@ CFARS: dict[str, Callable[[Receivers, Estimator], Cfar]] = {
 }
 ESTIMATORS = {"grid": Estimator(on_grid=True), "local": Estimator(), "joint": Estimator()}
 REFINERS: dict[str, Refiner | None] = {"grid": None, "local": None, "joint": refine_jointly}
-READERS = {"powers": ByPowers, "beams": ByBeams}
-
-
-DETECTORS: dict[str, Callable[[Receivers, Estimator], Detector]] = {"angle_doppler": AngleDoppler}
-PASSIVE_DETECTORS: dict[str, Callable[[Receivers, Estimator], Cfar]] = {"beams": BeamSearch}
-"""Detectors by `clutter_detector` and by `passive_detector`, beside the CFAR."""
 
 
 def filter_of(settings: Receivers) -> ClutterFilter | None:
@@ -57,21 +49,26 @@ def filter_of(settings: Receivers) -> ClutterFilter | None:
 
 def cfar_of(settings: Receivers) -> Cfar:
     """The CFAR that the settings name."""
-    return CFARS[settings.velocity_method](settings, ESTIMATORS[settings.refinement])
+    return cfar_with(settings, ESTIMATORS[settings.refinement])
+
+
+def cfar_with(settings: Receivers, estimator: Estimator) -> Cfar:
+    """The CFAR that the settings name, with an estimator of its peaks."""
+    return CFARS[settings.velocity_method](settings, estimator)
 
 
 def passive_detector_of(settings: Receivers) -> Cfar:
     """The passive terminal's detector."""
-    if settings.passive_detector == "cfar":
-        return cfar_of(settings)
-    return PASSIVE_DETECTORS[settings.passive_detector](settings, ESTIMATORS[settings.refinement])
+    make = PASSIVE_DETECTORS.load(settings.passive_detector)
+    detector: Cfar = make(settings, ESTIMATORS[settings.refinement])
+    return detector
 
 
 def detector_of(settings: Receivers) -> Detector:
     """The active terminal's detector."""
-    if settings.clutter_detector == "cfar":
-        return cfar_of(settings)
-    return DETECTORS[settings.clutter_detector](settings, ESTIMATORS[settings.refinement])
+    make = DETECTORS.load(settings.clutter_detector)
+    detector: Detector = make(settings, ESTIMATORS[settings.refinement])
+    return detector
 
 
 def refiner_of(settings: Receivers) -> Refiner | None:
@@ -83,4 +80,5 @@ def reader_of(settings: Receivers, dpsk_order: int) -> ByPowers:
     """The symbol reader that the settings name."""
     hidden = filter_of(settings)
     run_cells = None if hidden is None else hidden.least
-    return READERS[settings.symbol_decision](dpsk_order, run_cells)
+    reader: ByPowers = SYMBOL_READERS.load(settings.symbol_decision)(dpsk_order, run_cells)
+    return reader

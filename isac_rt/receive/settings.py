@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from isac_rt.registry import DETECTORS, PASSIVE_DETECTORS, SYMBOL_READERS
 from isac_rt.settings import Node, Problem
 
 COUNTS_WITH = {
@@ -44,7 +45,7 @@ class Receivers(Node):
     paper's. `local`, the default: maximum likelihood about each peak, at little cost. `joint`: all
     paths at once on the samples, which reaches the Cramer-Rao bound and separates paths in one cell
     by direction, but is slower."""
-    symbol_decision: Literal["powers", "beams"] = "powers"
+    symbol_decision: Annotated[str, SYMBOL_READERS] = "powers"
     """How a passive terminal reads symbols. `powers`, the default and the paper's: the powers of
     the receive antennas are added. `beams`: the antennas are added in phase towards the tracked
     paths, with a log-likelihood ratio for every bit; the most sensitive."""
@@ -95,12 +96,12 @@ class Receivers(Node):
     clutter_run_cells: Annotated[int, Field(ge=2)] = 15
     """Consecutive occupied range cells from which on a run counts as clutter, for `clutter_filter:
     runs`. The default lies below the 40 cells that the paper's clutter has at least."""
-    clutter_detector: Literal["cfar", "angle_doppler"] = "cfar"
+    clutter_detector: Annotated[str, DETECTORS] = "cfar"
     """What an active terminal compares a cell with. `cfar`, the default: the cells around it.
     `angle_doppler`: all antennas are added in phase towards every direction, and filtered with the
     clutter's covariance where mesh and own velocity predict clutter; own velocity and clutter level
     are corrected by the frame first."""
-    passive_detector: Literal["cfar", "beams"] = "cfar"
+    passive_detector: Annotated[str, PASSIVE_DETECTORS] = "cfar"
     """How a passive terminal finds what reflects to it. `cfar`, the default: cells that stand out
     of those around. `beams`: strong paths are taken out, then the antennas are added in phase
     towards every direction, and filtered with the clutter's covariance where the city's mesh and

@@ -24,6 +24,7 @@ from pydantic import (
     model_validator,
 )
 
+from isac_rt import registry
 from isac_rt.access.settings import Access
 from isac_rt.frame.settings import Array, Modulation, Noise, RoleChange
 from isac_rt.hardware.settings import Elements, FrontEnd, Response
@@ -38,6 +39,11 @@ from isac_rt.signal.settings import Accuracy
 from isac_rt.track.settings import Belief, Tracking
 from isac_rt.world.settings import City, Formation
 
+_PARTS = {
+    "clutter_detector": registry.DETECTORS,
+    "passive_detector": registry.PASSIVE_DETECTORS,
+    "symbol_decision": registry.SYMBOL_READERS,
+}
 OWN = "own"
 """Name of the scenario's own receivers beside those compared with them."""
 NEAREST_M = 0.05
@@ -305,7 +311,7 @@ class Scenario(Node):
             usual = {"velocity_method": ("auto", "conventional")}
         for at, receivers in self._all_receivers().items():
             for key, values in usual.items():
-                if (value := getattr(receivers, key)) not in values:
+                if not _fits(key, value := getattr(receivers, key), values):
                     yield Problem(
                         ((*at, key), ("radio", "scheme")),
                         f"{value} is not made for mode fmcw with scheme {r.scheme}; use "
@@ -329,7 +335,7 @@ class Scenario(Node):
             "link_acquisition": ("pilots",),
         }
         for at, receivers in self._all_receivers().items():
-            unlike = {k: v for k, v in able.items() if getattr(receivers, k) not in v}
+            unlike = {k: v for k, v in able.items() if not _fits(k, getattr(receivers, k), v)}
             if unlike:
                 named = " and ".join(f"{key}: {getattr(receivers, key)}" for key in unlike)
                 use = ", ".join(f"{key}: {values[0]}" for key, values in unlike.items())
@@ -573,6 +579,12 @@ class Scenario(Node):
         traced = self.propagation.model == "ray_traced" and self.city is not None
         by_beams = traced and any(one.passive_detector == "beams" for one in sets)
         return by_beams or any(one.needs_mesh for one in sets)
+
+
+def _fits(key: str, value: str, values: tuple[str, ...]) -> bool:
+    """Whether a setting of receivers has one of some values, or names another package's part, of
+    which nothing is known."""
+    return value in values or (key in _PARTS and value not in _PARTS[key].own)
 
 
 def _usual_preset(data: dict[str, Any]) -> Preset:

@@ -9,6 +9,8 @@ import numpy as np
 
 from isac_rt.propagation.build import Ground
 from isac_rt.propagation.model import Census, Propagation, Traced
+from isac_rt.receive.sense import Cfar
+from isac_rt.receive.symbols.powers import ByPowers, Symbols
 from isac_rt.world.city.materials import MaterialUse
 from isac_rt.world.city.mesh import Surface
 from isac_rt.world.city.sources import CityParts
@@ -41,6 +43,20 @@ class Attenuated:
 def attenuated(ground: Ground) -> Attenuated:
     """Make the model from the closed forms of free space."""
     return Attenuated(ground.free)
+
+
+def far(settings, estimator) -> Cfar:
+    """Make a CFAR that finds nothing within 10 km."""
+    return Cfar(settings.model_copy(update={"min_range_m": 1e4}), estimator)
+
+
+class Late(ByPowers):
+    """Reads every delay symbol one too high."""
+
+    def read(self, cube, prediction, antennas) -> Symbols:
+        """Read as by powers, and add one."""
+        found = super().read(cube, prediction, antennas)
+        return replace(found, delay=found.delay + 1)
 
 
 def count_walls(scenario: Path) -> None:
