@@ -10,15 +10,8 @@ import numpy as np
 
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
-from isac_rt.results.dataset import (
-    READ_LATE,
-    TABLES,
-    Columns,
-    Row,
-    dataset_of,
-    row_of,
-    row_type,
-)
+from isac_rt.results.columns import TABLES
+from isac_rt.results.dataset import READ_LATE, Columns, Row, dataset_of, row_of, row_type
 from isac_rt.results.metrics import SymbolCount, decibels
 from isac_rt.results.provenance import versions_in_use
 from isac_rt.results.records import KINDS, FrameRecord, LateRecord

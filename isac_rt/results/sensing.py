@@ -11,7 +11,8 @@ import numpy as np
 
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.results.bounds import error_quantile
-from isac_rt.results.dataset import MEASURES, PARTS, Columns, errors_of, row_type
+from isac_rt.results.columns import MEASURES, PARTS
+from isac_rt.results.dataset import Columns, errors_of, row_type
 from isac_rt.results.losses import LOSSES
 from isac_rt.results.metrics import GOSPA_CUTOFF_M, SymbolCount
 from isac_rt.results.records import KINDS
@@ -67,7 +68,7 @@ class Sensing:
 
     @classmethod
     def of(cls, values: Columns, tracks: Columns, frame: np.ndarray) -> Sensing:
-        """One link's frames in their order, of `isac_rt.results.dataset.TABLES`.
+        """One link's frames in their order, of `isac_rt.results.columns.TABLES`.
 
         Parameters
         ----------

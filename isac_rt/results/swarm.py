@@ -195,7 +195,7 @@ def summary_of(
     Parameters
     ----------
     pictures : by name the frames, and the bodies of all frames one after the other, of
-        `isac_rt.results.dataset.TABLES`
+        `isac_rt.results.columns.TABLES`
     names : of the UAVs
     """
     if not pictures:

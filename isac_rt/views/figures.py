@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import AutoLocator, LogLocator
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
-from isac_rt.results.dataset import MEASURES, errors_of
+from isac_rt.results.columns import MEASURES
+from isac_rt.results.dataset import errors_of
 from isac_rt.results.files import write_figure
 from isac_rt.results.recorder import Results
 from isac_rt.results.records import KINDS

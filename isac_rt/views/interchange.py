@@ -19,7 +19,8 @@ from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
-from isac_rt.results.dataset import DIMENSIONLESS, PATHS, Column, stacked
+from isac_rt.results.columns import DIMENSIONLESS, PATHS, Column
+from isac_rt.results.dataset import stacked
 from isac_rt.results.files import write_dataset
 from isac_rt.results.records import KINDS
 from isac_rt.runtime import needed

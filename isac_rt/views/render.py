@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from isac_rt.frame.link import Link
-from isac_rt.kernels.jit import jit
+from isac_rt.kernels import views_raster
+from isac_rt.kernels.jit import twin_of
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.results.files import write_figure
 from isac_rt.views.figures import KIND_COLOURS, ROLE_MARKERS, colour_of, words
@@ -85,38 +86,30 @@ def view_from(
     return View(np.stack([right, np.cross(right, away), away]), centre, half)
 
 
-@jit
-def _rasterise(corners: np.ndarray, depth: np.ndarray, face: np.ndarray) -> None:
-    """Depth buffer of triangles (F, 3, 3) in pixels and metres of depth; a pixel belongs to a
-    triangle if its middle does."""
-    height, width = depth.shape
-    for f in range(corners.shape[0]):
-        ax, ay, az = corners[f, 0]
-        bx, by, bz = corners[f, 1]
-        cx, cy, cz = corners[f, 2]
+@twin_of(views_raster.rasterise)
+def rasterise(corners: np.ndarray, depth: np.ndarray, face: np.ndarray) -> None:
+    """Draw triangles into a depth buffer; a pixel belongs to a triangle if its middle does.
+
+    Parameters
+    ----------
+    corners : (F, 3, 3) column and row [pixels] and depth [m] of the corners
+    depth : (height, width) [m], lowered where a triangle is nearer
+    face : (height, width) number of the nearest triangle, set there
+    """
+    rows, columns = (np.arange(size) + 0.5 for size in depth.shape)
+    for f, ((ax, ay, az), (bx, by, bz), (cx, cy, cz)) in enumerate(corners):
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
         if area == 0.0:
             continue
-        left, right = (
-            max(int(np.ceil(min(ax, bx, cx) - 0.5)), 0),
-            min(int(np.floor(max(ax, bx, cx) - 0.5)), width - 1),
-        )
-        low, high = (
-            max(int(np.ceil(min(ay, by, cy) - 0.5)), 0),
-            min(int(np.floor(max(ay, by, cy) - 0.5)), height - 1),
-        )
-        for row in range(low, high + 1):
-            y = row + 0.5
-            for column in range(left, right + 1):
-                x = column + 0.5
-                b = ((x - ax) * (cy - ay) - (cx - ax) * (y - ay)) / area
-                c = ((bx - ax) * (y - ay) - (x - ax) * (by - ay)) / area
-                if b < 0.0 or c < 0.0 or b + c > 1.0:
-                    continue
-                z = az + b * (bz - az) + c * (cz - az)
-                if z < depth[row, column]:
-                    depth[row, column] = z
-                    face[row, column] = f
+        x = columns[(columns >= min(ax, bx, cx)) & (columns <= max(ax, bx, cx))]
+        y = rows[(rows >= min(ay, by, cy)) & (rows <= max(ay, by, cy))][:, None]
+        box = np.ix_((y[:, 0] - 0.5).astype(int), (x - 0.5).astype(int))
+        b = ((x - ax) * (cy - ay) - (cx - ax) * (y - ay)) / area  # barycentric coordinates
+        c = ((bx - ax) * (y - ay) - (x - ax) * (by - ay)) / area
+        z = az + b * (bz - az) + c * (cz - az)
+        nearer = (b >= 0) & (c >= 0) & (b + c <= 1) & (z < depth[box])
+        depth[box] = np.where(nearer, z, depth[box])
+        face[box] = np.where(nearer, f, face[box])
 
 
 def depth_buffer(
@@ -131,7 +124,7 @@ def depth_buffer(
     """
     pixels = view.pixels(corners, width, height)
     depth, face = np.full((height, width), np.inf), np.full((height, width), -1, np.int32)
-    _rasterise(pixels, depth, face)
+    rasterise(pixels, depth, face)
     return depth, face
 
 

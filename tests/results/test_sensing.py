@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isac_rt.propagation.pathset import PathKind
-from isac_rt.results.dataset import MEASURES
+from isac_rt.results.columns import MEASURES
 from isac_rt.results.losses import LOSSES, Loss
 from isac_rt.results.sensing import FALSE_CAUSES, Sensing, summary_block
 

@@ -1,0 +1,498 @@
+"""What is recorded of every frame, declared once: each column's name, type, unit, meaning, source
+and dimensions. Rows of tables and the dataset are made from these."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import astuple, fields
+from operator import attrgetter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from isac_rt.propagation.pathset import PathSet
+from isac_rt.results.metrics import SymbolCount
+from isac_rt.results.records import KINDS, FrameRecord, ObserverRecord, PictureRecord, Use
+
+DIMENSIONLESS = "1"
+COMPONENTS = ("x", "y", "z", "v_x", "v_y", "v_z")
+SYMBOLS = ("delay", "dpsk", "bit")
+PARTS = ("localisation", "missed", "false")
+"""Of the GOSPA distance."""
+ERRORS = ("position", "velocity", "squared")
+"""Measures of a body's error."""
+SIZES = {
+    "kind": len(KINDS),
+    "symbol": len(SYMBOLS),
+    "part": len(PARTS),
+    "measure": len(ERRORS),
+    "count": len(fields(SymbolCount)),
+    **dict.fromkeys(("axis", "body_axis"), 3),
+    **dict.fromkeys(("component", "component_2"), len(COMPONENTS)),
+}
+"""Lengths of the dimensions of a row, but for that of the UAVs."""
+MEASURES = {
+    "range": ("m", "range_m"),
+    "velocity": ("m s-1", "velocity_mps"),
+    "azimuth": ("rad", "azimuth_deg"),
+    "elevation": ("rad", "elevation_deg"),
+}
+"""What is estimated of a UAV: unit inside, key in the summary."""
+
+
+class Column(NamedTuple):
+    """How an array of the dataset is made: from which attribute (or by which function) of a record
+    or a `PathSet`, over which dimensions beside frame and observer (or beside a
+    row), and with which value where an observer did not receive (or a row is shorter)."""
+
+    dtype: type
+    units: str
+    meaning: str
+    source: str | Callable[[Any], Any]
+    dims: tuple[str, ...] = ()
+    missing: float = 0
+
+    def read(self, record: object) -> Any:
+        """The value of a record."""
+        get = attrgetter(self.source) if isinstance(self.source, str) else self.source
+        return get(record)
+
+
+def _number(meaning: str, source: str | Callable[[Any], Any], dtype: type, **more: Any) -> Column:
+    return Column(dtype, DIMENSIONLESS, meaning, source, **more)
+
+
+def _found_sparse(o: ObserverRecord) -> int:
+    return -1 if o.reception.sparse is None else int(o.reception.sparse)
+
+
+def _path_counts(o: ObserverRecord) -> np.ndarray:
+    return np.bincount(o.paths.kind, minlength=len(KINDS))
+
+
+def _path_powers(o: ObserverRecord) -> np.ndarray:
+    return np.bincount(o.paths.kind, weights=o.paths.power, minlength=len(KINDS))
+
+
+def _of_poses(name: str) -> Callable[[FrameRecord], list[np.ndarray]]:
+    return lambda record: [getattr(pose, name) for pose in record.poses.values()]
+
+
+FRAMES: dict[str, Column] = {
+    "frame": _number("index of the frame", "frame", np.int64),
+    "time": Column(float, "s", "time of the middle of the frame", "time"),
+    "modulated": _number("the frame carries data", "modulated", bool),
+    **{
+        f"uav_{name}": Column(
+            float, units, f"{name} of the UAV in world axes", _of_poses(name), ("uav", "axis")
+        )
+        for name, units in (("position", "m"), ("velocity", "m s-1"), ("acceleration", "m s-2"))
+    },
+    "uav_attitude": _number(
+        "body axes of the UAV in world axes",
+        _of_poses("rotation"),
+        float,
+        dims=("uav", "axis", "body_axis"),
+    ),
+}
+"""One value for each frame."""
+OBSERVERS: dict[str, Column] = {
+    **{
+        f"{group}_{name}": Column(
+            float,
+            units,
+            f"{word} {name} of the UAV, seen by the observer",
+            f"{group}.{name}",
+            ("uav",),
+            np.nan,
+        )
+        for group, word in (("truth", "true"), ("detected", "detected"), ("tracked", "tracked"))
+        for name, (units, _) in MEASURES.items()
+    },
+    **{
+        f"bound_{name}": Column(
+            float,
+            units,
+            f"least standard deviation of an estimate of the {name} in noise (Cramer-Rao)",
+            f"bound.{name}",
+            ("uav",),
+            np.nan,
+        )
+        for name, (units, _) in MEASURES.items()
+    },
+    "in_view": _number("UAV inside the field of view", "in_view", bool, dims=("uav",)),
+    "shadowed": _number("UAV hidden by the city", "shadowed", bool, dims=("uav",)),
+    "hit": _number(
+        "UAV found by its own path within one resolution on all four axes",
+        "hit",
+        bool,
+        dims=("uav",),
+    ),
+    "loss": _number(
+        "what became of a UAV in view and unshadowed, -1: not one",
+        "loss",
+        np.int8,
+        dims=("uav",),
+        missing=-1,
+    ),
+    "target_snr": _number(
+        "SNR of the UAV's own path behind a matched filter over samples, chirps and antennas",
+        "target_snr",
+        float,
+        dims=("uav",),
+        missing=np.nan,
+    ),
+    "target_clutter": _number(
+        "power of the diffuse paths in the UAV's cell over the noise of one channel's map",
+        "target_clutter",
+        float,
+        dims=("uav",),
+        missing=np.nan,
+    ),
+    "cooperative": _number("UAV that is a terminal", "cooperative", bool, dims=("uav",)),
+    "genie": _number(
+        "probability that a matched filter at the true parameters finds the UAV's own path",
+        "genie",
+        float,
+        dims=("uav",),
+        missing=np.nan,
+    ),
+    "clutter_free": _number(
+        "probability that the receiver's detector would find the UAV in noise alone",
+        "clutter_free",
+        float,
+        dims=("uav",),
+        missing=np.nan,
+    ),
+    **{
+        f"{of}_{part}": Column(
+            float,
+            "m2",
+            f"{words} in the square of the GOSPA distance of the confirmed tracks{but}",
+            f"{of}.{part}",
+            missing=np.nan,
+        )
+        for of, but in (("gospa", ""), ("gospa_targets", ", terminals left out"))
+        for part, words in (
+            ("localisation", "errors of position"),
+            ("missed", "UAVs without a track"),
+            ("false", "tracks without a UAV"),
+        )
+    },
+    "processed": _number("the observer processed the frame", lambda o: True, bool),
+    "state": _number("state of the terminal, -1: not processed", "state", np.int8, missing=-1),
+    "decoded": _number("data symbols were decided", "reception.decoded", bool),
+    "latency_frames": _number(
+        "frames after which the data were read, 0: at once, -1: not, or no data",
+        "latency",
+        np.int16,
+        missing=-1,
+    ),
+    "line_of_sight": _number(
+        "the receiver says that it sees its reference path", "reception.line_of_sight", bool
+    ),
+    "fell_back": _number(
+        "sent by the conventional schedule in place of the random one", "fell_back", bool
+    ),
+    "sparse": _number(
+        "the receiver found the scene sparse: 1, not: 0, not judged: -1",
+        _found_sparse,
+        np.int8,
+        missing=-1,
+    ),
+    "reference_power": Column(
+        float,
+        "W",
+        "mean power of the reference path per sample and antenna, as received",
+        "reception.reference_power",
+        missing=np.nan,
+    ),
+    "reference_snr": _number(
+        "SNR of the reference path per sample and antenna before processing, linear",
+        "reference_snr",
+        float,
+        missing=np.nan,
+    ),
+    "num_false": _number("detections that no path explains", "num_false", np.int32),
+    "num_clutter": _number(
+        "detections that something other than a UAV's own path explains", "num_clutter", np.int32
+    ),
+    "slips": _number("symbols decided outside their alphabet", "slips", np.int32),
+    "path_count": _number("number of paths", _path_counts, np.int32, dims=("kind",)),
+    "path_power": _number("sum of |gain|^2 of the paths", _path_powers, float, dims=("kind",)),
+    "symbol_errors": _number(
+        "symbols, wrong or undecided",
+        lambda o: [o.symbols.delay_errors, o.symbols.dpsk_errors, o.symbols.bit_errors],
+        np.int64,
+        dims=("symbol",),
+    ),
+    "symbol_erased": _number(
+        "symbols, undecided",
+        lambda o: [
+            o.symbols.delay_erased,
+            o.symbols.dpsk_erased,
+            o.symbols.bits_total - o.symbols.bits_decoded,
+        ],
+        np.int64,
+        dims=("symbol",),
+    ),
+    "symbol_total": _number(
+        "symbols, sent to the observer",
+        lambda o: [o.symbols.delay_total, o.symbols.dpsk_total, o.symbols.bits_total],
+        np.int64,
+        dims=("symbol",),
+    ),
+}
+"""One value for each frame and observer."""
+
+
+def _of_detections(name: str, column: int | None = None) -> Callable[[ObserverRecord], np.ndarray]:
+    def read(o: ObserverRecord) -> np.ndarray:
+        values = getattr(o.reception.detections, name)
+        return values if column is None else values[:, column]
+
+    return read
+
+
+DETECTIONS: dict[str, Column] = {
+    "range": Column(
+        float,
+        "m",
+        "range of the detection; one way at the AT, path length at a PT",
+        _of_detections("range"),
+    ),
+    "velocity": Column(
+        float, "m s-1", "rate of the range, positive receding", _of_detections("velocity")
+    ),
+    "u_x": _number(
+        "direction cosine along the body's X axis", _of_detections("direction", 0), float
+    ),
+    "u_z": _number(
+        "direction cosine along the body's Z axis", _of_detections("direction", 1), float
+    ),
+    "snr": _number("SNR of the range-Doppler cell, linear", _of_detections("snr"), float),
+    **{
+        f"{name}_std": Column(
+            float, units, f"standard deviation of {article}{name}", _of_detections("std", i)
+        )
+        for i, (name, units, article) in enumerate(
+            (
+                ("range", "m", "the "),
+                ("velocity", "m s-1", "the "),
+                ("u_x", DIMENSIONLESS, ""),
+                ("u_z", DIMENSIONLESS, ""),
+            )
+        )
+    },
+    "is_reference": _number("line of sight at a PT", _of_detections("is_reference"), bool),
+    "kind": _number("kind of the path that explains it, -1: none", "detection_kind", np.int8),
+    "target": _number("index of the UAV that explains it, -1: none", "detection_target", np.int16),
+    "order": _number(
+        "interactions with the city of the path that explains it, 0: direct, -1: no path",
+        "detection_order",
+        np.int16,
+    ),
+    "face": _number(
+        "first face of the city's mesh on the path that explains it, -1: none",
+        "detection_face",
+        np.int32,
+    ),
+    "skirt": _number(
+        "the path that explains it lies more than a cell away", "detection_skirt", bool
+    ),
+}
+TRACKS: dict[str, Column] = {
+    "id": _number("number of the track, unique at its observer", "tracks.id", np.int32),
+    "range": Column(float, "m", "range of the track", "tracks.range"),
+    "velocity": Column(
+        float, "m s-1", "radial velocity of the track, positive receding", "tracks.velocity"
+    ),
+    "u_x": _number("direction cosine along the body's X axis", "tracks.u_x", float),
+    "u_z": _number("direction cosine along the body's Z axis", "tracks.u_z", float),
+    "confirmed": _number("the track is confirmed", "tracks.confirmed", bool),
+    "state": _number(
+        "position [m] and velocity [m/s] relative to the observer, world axes",
+        "tracks.state",
+        float,
+        dims=("component",),
+    ),
+    "covariance": _number(
+        "covariance of the state [m^2, m^2/s, m^2/s^2]",
+        "tracks.covariance",
+        float,
+        dims=("component", "component_2"),
+    ),
+    "kind": _number(
+        "kind of the path that explains its latest detection, -1: none", "tracks.kind", np.int8
+    ),
+    "target": _number(
+        "index of the UAV on the path that explains its latest detection, -1: none",
+        "tracks.target",
+        np.int16,
+    ),
+    "uav": _number("index of the UAV in view that it follows, -1: none", "tracks.uav", np.int16),
+}
+
+
+def _of_picture(name: str, column: int) -> Callable[[PictureRecord], np.ndarray]:
+    return lambda p: getattr(p, name)[:, column]
+
+
+PICTURES: dict[str, Column] = {
+    "gospa": Column(
+        float,
+        "m2",
+        "square of the GOSPA distance: localisation, missed, false",
+        "gospa",
+        ("part",),
+        np.nan,
+    ),
+    "seen": _number("target in view of a terminal", "seen", bool, dims=("uav",)),
+    "found": _number("target in view that the picture has", "found", bool, dims=("uav",)),
+    "error": _number(
+        "of targets found: position [m], velocity [m s-1], squared error of position in the "
+        "deviations stated over its axes",
+        "error",
+        float,
+        dims=("uav", "measure"),
+        missing=np.nan,
+    ),
+    "false": _number("bodies that stand for nobody", "false", np.int32),
+    "hidden": _number("bodies that stand for a target in nobody's view", "hidden", np.int32),
+    "unrecognised": _number(
+        "bodies that stand for a terminal without being recognised", "unrecognised", np.int32
+    ),
+    "reports": _number("tracks or detections heard from others that count", "reports", np.int32),
+    "age": Column(float, "s", "mean age of the tracks heard from others", "age", missing=np.nan),
+    "messages": _number("messages that ended in the frame", "messages", np.int32),
+    "lost": _number("those of them that were lost", "lost", np.int32),
+    "late": _number(
+        "earlier messages, lost until then, that came with a frame read late", "late", np.int32
+    ),
+    "bits": _number("bits of these messages", "bits", np.int64),
+    "room": _number("bits that the ways to the terminal had for messages", "room", np.int64),
+    "left_out": _number(
+        "tracks or detections that the messages had no room for", "left_out", np.int32
+    ),
+}
+"""One value for each frame and picture."""
+FUSED: dict[str, Column] = {
+    "origin": _number("link whose track names the body, along observer", "origin", np.int16),
+    "number": _number("number of that track", "number", np.int32),
+    **{
+        f"{word}{axis}{suffix}": Column(
+            float,
+            units,
+            f"{meaning} {axis} of the {what}",
+            _of_picture(source, 3 * rate + i),
+        )
+        for source, suffix, meaning in (("mean", "", "world"), ("std", "_std", "deviation of"))
+        for rate, (word, units, what) in enumerate(
+            (("", "m", "position"), ("v", "m s-1", "velocity"))
+        )
+        for i, axis in enumerate("xyz")
+    },
+    "members": _number("tracks that are taken for the body", "members", np.int16),
+    "terminal": _number(
+        "index of the UAV of the swarm that it is recognised as, -1: none", "terminal", np.int16
+    ),
+    "uav": _number("index of the target that it is found as, -1: none", "uav", np.int16),
+}
+"""Bodies of the pictures."""
+
+
+def _power_db(p: PathSet) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return 10 * np.log10(p.power)
+
+
+def _component(end: str, axis: int) -> Callable[[PathSet], np.ndarray]:
+    return lambda p: getattr(p, end)[:, axis]
+
+
+PATHS: dict[str, Column] = {
+    "gain_re": _number("real part of the complex gain without carrier phase", "gain.real", float),
+    "gain_im": _number(
+        "imaginary part of the complex gain without carrier phase", "gain.imag", float
+    ),
+    "power_db": Column(float, "dB", "|gain|^2", _power_db),
+    "delay": Column(float, "s", "delay at the middle of the frame", "delay"),
+    "delay_rate": _number("rate of the delay", "delay_rate", float),
+    "delay_accel": Column(float, "s-1", "second derivative of the delay", "delay_accel"),
+    **{
+        f"{end}_{axis}": _number(
+            f"{axis} of the unit vector {where}, world axes", _component(end, i), float
+        )
+        for end, where in (
+            ("departure", "along the first segment"),
+            ("arrival", "towards where the wave comes from"),
+        )
+        for i, axis in enumerate("xyz")
+    },
+    "kind": _number("kind of path, an index into the dimension kind", "kind", np.int8),
+    "target": _number("index of the UAV involved, -1: none", "target", np.int16),
+    "bounces": _number("interactions with the city", "bounces", np.int16),
+    "begin": Column(float, "s", "start of the path's life since the middle of the frame", "begin"),
+    "end": Column(float, "s", "end of the path's life since the middle of the frame", "end"),
+    "points": Column(
+        float,
+        "m",
+        "interaction points in world axes, NaN where there is none",
+        "points",
+        ("bounce", "axis"),
+        np.nan,
+    ),
+    "faces": _number(
+        "face of the city mesh at each point, -1 where there is none",
+        "faces",
+        np.int32,
+        dims=("bounce",),
+        missing=-1,
+    ),
+}
+"""Columns of the path ledger, read off a `PathSet`."""
+USES = {f.name: _number("", f.name, float) for f in fields(Use)} | {
+    "kept": _number("", lambda use: [use.kept.get(kind, 0) for kind in KINDS], int, dims=("kind",))
+}
+"""Of a `Use`, which only the summary needs."""
+TABLES: dict[str, dict[str, Column]] = {
+    "frame": FRAMES | {"dropped": _number("", "dropped", int)},
+    "observer": OBSERVERS
+    | {"symbols": _number("", lambda o: astuple(o.symbols), np.int64, dims=("count",))},
+    "det": DETECTIONS,
+    "track": TRACKS,
+    "use": USES,
+    "picture": PICTURES,
+    "fused": FUSED,
+}
+"""What is kept of every frame: in the dataset and beside it."""
+
+MAPS = (
+    (
+        "map_power",
+        "range_doppler",
+        np.float32,
+        ("row", "doppler"),
+        "W",
+        "range-Doppler map, accumulated over antennas",
+    ),
+    ("map_range", "range_axis", float, ("row",), "m", "range of the map's rows"),
+    ("map_velocity", "velocity_axis", float, ("doppler",), "m s-1", "velocity of its columns"),
+    (
+        "map_equivalent_range",
+        "equivalent_range",
+        np.float32,
+        ("cell", "chirp"),
+        "W0.5",
+        "magnitude over range cell and chirp before data removal",
+    ),
+    (
+        "map_equivalent_detections",
+        "equivalent_detections",
+        bool,
+        ("cell", "chirp"),
+        DIMENSIONLESS,
+        "cells that the one-dimensional CFAR finds, chirp by chirp",
+    ),
+)
+"""(variable, attribute of `isac_rt.receive.types.Maps`, type, dimensions, unit, meaning)"""
