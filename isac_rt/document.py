@@ -283,6 +283,18 @@ class Document:
         self.data: dict[str, Any] = data
         self.places = reader.places
 
+    def drop_removed(self, root: type[BaseModel]) -> None:
+        """Take out the keys and values of earlier versions that the nodes of `root` list."""
+
+        def drop(tree: dict[str, Any], at: tuple[str, ...]) -> None:
+            for name, value in list(tree.items()):
+                if _instead_of_removed(root, (*at, name), value) is not None:
+                    del tree[name]
+                elif isinstance(value, dict):
+                    drop(value, (*at, name))
+
+        drop(self.data, ())
+
     @classmethod
     def of_tree(cls, tree: Mapping[str, Any]) -> Document:
         """The document of a mapping made in Python, from the working folder.

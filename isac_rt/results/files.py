@@ -170,4 +170,4 @@ def open_results(folder: str | Path) -> Results:
             f"cannot read results in {folder}: {shortly(problem)}; give the folder that "
             "`isac-rt run` wrote"
         ) from problem
-    return Results(dataset, summary, load_scenario(folder / "scenario.yaml"))
+    return Results(dataset, summary, load_scenario(folder / "scenario.yaml", without_removed=True))

@@ -23,6 +23,8 @@ def load(
     overrides: Iterable[str] = (),
     frames: int | None = None,
     seed: int | None = None,
+    *,
+    without_removed: bool = False,
 ) -> Scenario:
     """Read and check a scenario.
 
@@ -32,6 +34,7 @@ def load(
         to its folder, or to the working folder
     overrides : of the form "radio.groups=2", as after --set; the value is YAML
     frames, seed : replace the file's, as --frames and --seed do
+    without_removed : leave out keys and values that earlier versions had, instead of refusing them
 
     Returns
     -------
@@ -59,6 +62,8 @@ def load(
         document = Document.of_tree(path)
     else:
         document = Document(Path(path), "a scenario needs at least a swarm")
+    if without_removed:
+        document.drop_removed(Scenario)
     for override in overrides:
         document.override(override)
     for name, value in (("frames", frames), ("seed", seed)):
