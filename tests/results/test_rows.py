@@ -71,8 +71,8 @@ def test_a_frame_takes_the_bytes_of_its_rows():
 
 @pytest.mark.slow
 def test_memory_of_a_run_grows_by_its_rows():
-    """A whole run with two sets of receivers, between its 40th frame and its 120th: its rows have
-    21 kB a frame. What comes and goes with a frame is 1 MB."""
+    """A whole run with two sets of receivers, between its 40th frame and its 120th: less
+    than 25 kB a frame. What comes and goes with a frame is 1 MB."""
     small = ["radio.samples_per_chirp=256", "radio.chirps_per_frame=48", "frame_interval_s=0.0051"]
     compare = ["cooperation=tracks", "compare={pilots: {receivers: {link_acquisition: pilots}}}"]
     scenario = irt.load(SCENES / "paper_swarm_consistent.yaml", small + compare, frames=120)
