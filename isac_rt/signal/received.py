@@ -18,7 +18,7 @@ What is left out is a path's noise within a chirp beyond that of tau_0 (`isac_rt
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -31,18 +31,7 @@ from isac_rt.hardware.front_end import IDEAL, Ends
 from isac_rt.hardware.oscillator import Mask, Oscillator, Record, spread
 from isac_rt.hardware.sweep import Ramp, read_at, sampled, short_read
 from isac_rt.kernels.signal_direct import add_direct
-from isac_rt.signal.chain import (
-    NO_ROWS,
-    NO_TURNS,
-    NOTHING,
-    Turns,
-    Work,
-    add_phases,
-    finish,
-    phasors,
-    places_of,
-    rows_of,
-)
+from isac_rt.signal.chain import Turns, Work, add_phases, finish, phasors, places_of
 from isac_rt.signal.if_signal import heard
 from isac_rt.signal.methods import Method
 from isac_rt.signal.noise import WhiteNoise
@@ -112,26 +101,27 @@ def _lag(tones: Tones) -> np.ndarray:
 def _turns(w: Waveform, tones: Tones, ends: Ends) -> Turns:
     """What turns and scales the samples of all receive elements alike, oscillators apart: gains
     over the chirp, and the difference of the two ramps."""
-    sender, out = ends.senders[0] if ends.senders else IDEAL, NO_TURNS
+    sender, out = ends.senders[0] if ends.senders else IDEAL, Turns()
     if sender.transmit_response is not None:
         late = np.rint(_lag(tones) * w.sampling_rate).astype(np.int64)
         most = max(int(late.max()), 0)
         antenna = tones.antenna[0] if len(tones.antenna) else np.zeros((1, 1), np.int64)
-        out = out._replace(
-            sent=rows_of(sampled(sender.transmit_response, w.num_samples, most)),
+        out = replace(
+            out,
+            sent=sampled(sender.transmit_response, w.num_samples, most).astype(np.complex64),
             antenna=_by_chirp(w, antenna),
             begin=_by_chirp(w, np.clip(most - late, 0, most)),
         )
     own = ends.receiver.receive_response
     if own is not None and own.common:
-        out = out._replace(gain=rows_of(sampled(own, w.num_samples)[:1])[0])
+        out = replace(out, gain=sampled(own, w.num_samples)[0].astype(np.complex64))
     ramps = sender.ramp, ends.receiver.ramp
     if any(ramps):
         theirs, mine = (0.0 if r is None else r.cycles(w.fast_time) for r in ramps)
-        out = out._replace(always=mine - theirs + np.zeros(w.num_samples))
+        out = replace(out, always=mine - theirs + np.zeros(w.num_samples))
         if sender.ramp is not None:
             place = np.arange(w.num_samples) + _shift(w, tones, sender.ramp)
-            out = out._replace(place=place, beat=_by_chirp(w, _band(w, tones)))
+            out = replace(out, place=place, beat=_by_chirp(w, _band(w, tones)))
     return out
 
 
@@ -165,52 +155,33 @@ def _work(
     samples: np.ndarray,
 ) -> Work:
     """What the pass through the `samples` has to do."""
-    taps, shift, reads, first = NO_ROWS, NO_ROWS[:0].ravel(), NO_ROWS, 0
+    work = Work(turns=turns, noise=noise)
     ramp = ends.senders[0].ramp if ends.senders else None
     if ramp is not None:
         late = _shift(w, tones, ramp)
         near = short_read(float(np.abs(late).max()))
         if near is not None:
-            taps, shift = near.astype(np.float32), np.repeat(late, 2).astype(np.float32)
+            work = replace(work, taps=near.astype(np.float32), shift=late.astype(np.float32))
         else:
             first, weights = read_at(late)
-            reads = np.repeat(weights, 2, axis=1).astype(np.float32)
-    elements, own = None, ends.receiver.receive_response
+            work = replace(work, reads=weights.astype(np.float32), first=first)
+    own, c = ends.receiver.receive_response, ends.receiver.converter
     if own is not None and not own.common:
-        elements = sampled(own, w.num_samples)
-    c = ends.receiver.converter
-    key = np.asarray(noise.seed_words, np.uint32)
-    work = Work(
-        taps,
-        shift,
-        reads,
-        first,
-        turns.beat,
-        turns,
-        rows_of(elements),
-        float(noise.power),
-        key,
-        0.0 if c is None or np.isinf(c.saturation) else c.saturation,
-        np.array([1, 0, 0, 1, 0, 1, 0], np.float32),
-        0.0,
-        0.0,
-    )
+        work = replace(work, elements=sampled(own, w.num_samples).astype(np.complex64))
     if c is None:
         return work
-    acts = c.mixing != ((1.0, 0.0), (0.0, 1.0)) or c.constant != 0 or c.real
-    mixing = np.array([*c.mixing[0], *c.mixing[1], c.constant, not c.real, acts], np.float32)
-    work = work._replace(mixing=mixing)
+    saturation = 0.0 if np.isinf(c.saturation) else c.saturation
+    work = replace(work, saturation=saturation, mixing=c.mixing, constant=c.constant, real=c.real)
     if not c.bits:
         return work
     full = c.full_scale or c.headroom * _level(samples, work, w.num_chirps)
-    return work._replace(step=2 * full / 2**c.bits, most=2.0 ** (c.bits - 1))
+    return replace(work, step=2 * full / 2**c.bits, most=2.0 ** (c.bits - 1))
 
 
 def _level(samples: np.ndarray, work: Work, num_chirps: int) -> float:
     """RMS of the strongest element in a chirp like the first of each group, noise included."""
     trial = np.ascontiguousarray(samples[:, :, :1])
-    turns = work.turns.of_rows(num_chirps)
-    finish(trial, work._replace(beat=turns.beat, turns=turns))
+    finish(trial, replace(work, turns=work.turns.of_rows(num_chirps)))
     return float(np.sqrt((np.abs(trial) ** 2).mean(axis=(0, 2, 3)).max())) or 1.0
 
 
@@ -320,13 +291,11 @@ class _Flicker:
         theirs = self.theirs[0] if self.theirs else None
         if theirs is not None and theirs is self.mine and self.main == 0:
             return turns
-        begin = self.begin.ravel()
-        first, weight = np.zeros((begin.size, 2), np.int64), np.zeros((begin.size, 2, 4))
-        for end, (one, late, sign) in enumerate([(self.mine, 0.0, 1.0), (theirs, self.main, -1.0)]):
+        begin, parts = self.begin.ravel(), []
+        for one, late, sign in ((self.mine, 0.0, 1.0), (theirs, self.main, -1.0)):
             if one is not None:
-                first[:, end], weight[:, end] = places_of(one, begin - late, sign)
-        mine, sent = (NOTHING if one is None else one.values for one in (self.mine, theirs))
-        return turns._replace(records=(mine, sent), first=first, weight=weight)
+                parts.append((one.values, *places_of(one, begin - late, sign)))
+        return replace(turns, oscillators=tuple(parts))
 
     def apart(self, path: int) -> np.ndarray:
         """(M, P, N) complex64, the phase of a path beside the common one, as a factor."""

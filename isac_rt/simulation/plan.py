@@ -40,7 +40,6 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.kernels.jit import jit
 from isac_rt.kernels.signal_gridded import GRIDDED_ERROR
 from isac_rt.propagation.clutter.cells import Density, error_for
 from isac_rt.propagation.model import Census
@@ -250,16 +249,6 @@ def motion(paths: PathSet, waveform: Waveform) -> np.ndarray:
     return np.abs(paths.delay_rate) * t + np.abs(paths.delay_accel) * t**2 / 2
 
 
-@jit
-def _sums(cell: np.ndarray, power: np.ndarray) -> np.ndarray:
-    """Running sums of powers (K,) from the first of each cell on, cells one after the other."""
-    out = power.copy()
-    for i in range(1, power.size):
-        if cell[i] == cell[i - 1]:
-            out[i] += out[i - 1]
-    return out
-
-
 def faintest(power: np.ndarray, cell: np.ndarray, limit: float) -> tuple[np.ndarray, float]:
     """The faintest of each cell whose powers together stay within a limit.
 
@@ -275,7 +264,10 @@ def faintest(power: np.ndarray, cell: np.ndarray, limit: float) -> tuple[np.ndar
     """
     some = np.flatnonzero(power <= limit)
     order = some[np.lexsort([power[some], cell[some]])]
-    total = _sums(cell[order], power[order])
+    sums, cells = np.cumsum(power[order]), cell[order]
+    starts = np.flatnonzero(np.diff(cells, prepend=cells[:1] - 1))
+    before = np.where(starts > 0, sums[starts - 1], 0.0) if starts.size else sums
+    total = sums - np.repeat(before, np.diff(starts, append=sums.size))
     gone = total <= limit
     mask = np.zeros(len(power), bool)
     mask[order] = gone

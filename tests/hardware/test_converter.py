@@ -7,7 +7,7 @@ import pytest
 
 from isac_rt.hardware.converter import converter_of, saturated, watts
 from isac_rt.hardware.settings import Converter
-from isac_rt.signal.chain import NO_ROWS, NO_TURNS, Work, finish
+from isac_rt.signal.chain import Work, finish
 
 TURNS = (5**0.5 - 1) / 10  # no sine that comes round soon
 
@@ -20,14 +20,16 @@ def tone(amplitude=1.0, count=2**15):
 def behind(samples, **stated):
     """Samples behind a converter with a full scale of 1."""
     c = converter_of(Converter(**stated))
-    acts = np.array([*c.mixing[0], *c.mixing[1], c.constant, not c.real, 1], np.float32)
-    step = 2.0 / 2**c.bits if c.bits else 0.0
-    key = np.zeros(2, np.uint32)
-    most = 2.0 ** (c.bits - 1)
     out = samples.copy()
-    saturation = 0.0 if np.isinf(c.saturation) else c.saturation
-    nothing = NO_ROWS, NO_ROWS.ravel(), NO_ROWS, 0, NO_ROWS.ravel().astype(float), NO_TURNS, NO_ROWS
-    finish(out, Work(*nothing, 0.0, key, saturation, acts, step, most))
+    work = Work(
+        saturation=0.0 if np.isinf(c.saturation) else c.saturation,
+        mixing=c.mixing,
+        constant=c.constant,
+        real=c.real,
+        step=2.0 / 2**c.bits if c.bits else 0.0,
+        most=2.0 ** (c.bits - 1),
+    )
+    finish(out, work)
     return out.ravel()
 
 
