@@ -134,9 +134,7 @@ class Bench:
         if kind.clutter == "gaussian":
             return None
         if kind.clutter == "rayleigh":
-            ranges, gains = rayleigh_cells(
-                Clutter(model="rayleigh"), w.range_cell(passes), UAV_M, own_rng
-            )
+            ranges, gains = rayleigh_cells(Clutter(model="rayleigh"), w.range_cell(passes), own_rng)
             return resting(
                 ranges, gains, passes, self.scenes.epoch, self.poses(kind)[0].rotation[:, 1]
             )

@@ -133,7 +133,7 @@ def draw_target(case: Setting, rng: np.random.Generator) -> Target:
     ranges, amplitudes = np.zeros(0), np.zeros(0)
     if case.clutter:
         ranges, amplitudes = rayleigh_cells(
-            Clutter(model="rayleigh"), w.range_cell(case.passes), distance, rng
+            Clutter(model="rayleigh"), w.range_cell(case.passes), rng
         )
     return Target(np.array([distance, velocity, *u]), away, phase, ranges, amplitudes)
 

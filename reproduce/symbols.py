@@ -125,7 +125,7 @@ def draw_frame(link: Setting, seed: int, index: int) -> LinkFrame:
     paths = waves(epoch, length / SPEED_OF_LIGHT, ends=ends, radius=length)
     lengths, weights = np.array([length]), np.ones(1)
     if link.clutter:
-        ranges, amplitudes = rayleigh_cells(Clutter(model="rayleigh"), w.range_cell(1), length, rng)
+        ranges, amplitudes = rayleigh_cells(Clutter(model="rayleigh"), w.range_cell(1), rng)
         delay = ranges / SPEED_OF_LIGHT
         others = waves(epoch, delay, gain=amplitudes, ends=ends, kind=PathKind.DIFFUSE)
         paths = merge([paths, others])

@@ -151,7 +151,7 @@ EXCUSED = [
     ),
     (
         "propagation/clutter/rayleigh.py",
-        "- (inside if clutter.place",
+        "- rng.uniform(-0.5, 0.5, count)",
         "a draw from -0.5 to 0.5: the same law",
     ),
     ("receive/estimate.py", "step / np.sign([gx, gy])", "a product with a sign is the quotient"),

@@ -4,7 +4,7 @@ a run has to come."""
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -57,6 +57,15 @@ class Propagation(Node):
 class Clutter(Node):
     """What is received beside lines of sight, targets, ghosts and mirror images."""
 
+    REMOVED: ClassVar[dict[str, str]] = {
+        "level_of": "leave it out: level_db is of the mean power; of the mean amplitude, add 1.05",
+        "centre": "centre_m with the range of the reference path twice, or leave it out",
+        "place": "leave it out: scatterers lie anywhere in their range cells",
+        "direction": "leave it out: directions are drawn over the field of view",
+        "cell_correlation": "leave it out: cells are independent",
+        "redraw": "leave it out: every frame has a draw of its own",
+    }
+
     model: Literal["none", "gaussian", "rayleigh", "diffuse", "field"] = "none"
     """Kind of clutter. `none`, the default; with `noise.model: snr` it is the paper's "Gaussian
     noise environment". `gaussian`: white noise beside the thermal noise. `rayleigh`, the paper's
@@ -67,34 +76,16 @@ class Clutter(Node):
     """Power of `gaussian` clutter over that of the thermal noise [dB]. By default they are
     alike."""
     level_db: Decibels = 10.0
-    """Mean level of one cell of `rayleigh` clutter over the reference path of the link [dB]: the
+    """Mean power of one cell of `rayleigh` clutter over the reference path of the link [dB]: the
     strongest target at an active terminal, the line of sight at a passive one, as if nothing hid
     it. The default is the paper's."""
-    level_of: Literal["power", "amplitude"] = "power"
-    """Whether `level_db` of `rayleigh` clutter is that of the mean power, the default, or of the
-    mean amplitude, which is 1.05 dB more of power."""
     cells: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (40, 50)
     """Least and most consecutive range cells of `rayleigh` clutter; the number is drawn in between.
     The default is the paper's."""
-    centre: Literal["drawn", "reference"] = "drawn"
-    """Where the middle of `rayleigh` clutter lies: `drawn` uniformly within `centre_m`, the
-    default, or at the range of the `reference` path."""
     centre_m: tuple[Positive, Positive] = (20.0, 30.0)
     """Least and greatest range of the middle of `rayleigh` clutter that is drawn [m], twice the
     same to fix it; one way at an active terminal, path length at a passive one. The default is the
     paper's."""
-    place: Literal["drawn", "grid"] = "drawn"
-    """Where a scatterer of `rayleigh` clutter lies: `drawn` anywhere in its range cell, the
-    default, or in its middle (`grid`)."""
-    direction: Literal["field_of_view", "reference"] = "field_of_view"
-    """Directions of `rayleigh` clutter: drawn over the `field_of_view` of both ends, the default,
-    or all that of the `reference` path."""
-    cell_correlation: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Correlation of the complex amplitudes of neighbouring cells of `rayleigh` clutter, from 0 to
-    1. By default cells are independent."""
-    redraw: Literal["each_frame", "once"] = "each_frame"
-    """How often `rayleigh` clutter is drawn: in `each_frame`, the default, or `once` for the
-    run."""
     rays: Annotated[int, Field(ge=100, le=10_000_000)] = 20_000
     """Rays that a transmitter sends out for `diffuse` clutter. More rays give more and weaker
     paths, the same power in all, and take longer. The default gives some thousand paths a link."""
@@ -120,8 +111,6 @@ class Clutter(Node):
         return 1 + 10 ** (self.clutter_to_noise_db / 10) if self.model == "gaussian" else 1.0
 
     def applies(self, name: str) -> bool:
-        if name == "centre_m" and self.centre != "drawn":
-            return False
         return name == "model" or name in CLUTTER_KEYS[self.model]
 
     def problems(self) -> Iterator[Problem]:
@@ -139,14 +128,8 @@ CLUTTER_KEYS: dict[str, frozenset[str]] = {
     "rayleigh": frozenset(
         {
             "level_db",
-            "level_of",
             "cells",
-            "centre",
             "centre_m",
-            "place",
-            "direction",
-            "cell_correlation",
-            "redraw",
         }
     ),
     "diffuse": frozenset({"rays"}),

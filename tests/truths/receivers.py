@@ -442,7 +442,7 @@ def rayleigh_clutter() -> float:
     """Amplitudes of the paper's clutter are Rayleigh, on average 10 dB over the reference; 40 to 50
     cells about 20 to 30 m."""
     rng, clutter = np.random.default_rng(5), Clutter(model="rayleigh")
-    draws = [rayleigh_cells(clutter, 0.25, 17.0, rng) for _ in range(300)]
+    draws = [rayleigh_cells(clutter, 0.25, rng) for _ in range(300)]
     power = np.abs(np.concatenate([a for _, a in draws])) ** 2 / 10
     counts = {len(r) for r, _ in draws}
     ranges = np.array([r.mean() for r, _ in draws])

@@ -3,20 +3,17 @@ of any propagation model.
 
 The paper (section V.A) says: Rayleigh amplitudes "with the noise variance as 1", on average 10 dB
 over the target's; 40 to 50 consecutive range cells; their centre drawn between 20 and 30 m;
-velocity 0. What it leaves open is a key of `clutter`:
+velocity 0. What it leaves open is settled here so:
 
-- 10 dB of mean power or of mean amplitude (`level_of`), over the link's reference path: at a PT its
-  line of sight, which the paper calls its target;
-- where the centre is (`centre`, `centre_m`); a run that would begin before cell 1 is moved out, not
-  cut;
-- whether all is drawn anew in every frame (`redraw`) - independent amplitudes from frame to frame,
-  but constant, so coherent, within one;
-- scatterers on the range grid, or anywhere in their cells (`place`), where their sidelobes show;
-- directions (`direction`); uniform in azimuth and elevation over the field of view. At a terminal's
-  own link a wave leaves where it comes from, between two terminals the two directions are
-  independent;
-- "strong correlation between adjacent distance grids" (`cell_correlation`, a first-order
-  autoregression along the cells).
+- 10 dB of mean power over the link's reference path: at a PT its line of sight, which the paper
+  calls its target;
+- a run that would begin before cell 1 is moved out, not cut;
+- all is drawn anew in every frame: independent amplitudes from frame to frame, but constant, so
+  coherent, within one;
+- scatterers lie anywhere in their cells, where their sidelobes show;
+- directions are uniform in azimuth and elevation over the field of view. At a terminal's own link
+  a wave leaves where it comes from, between two terminals the two directions are independent;
+- cells are independent of each other.
 
 Each scatterer is a path of kind DIFFUSE with a delay rate of exactly 0: clutter that stands still
 relative to the receiver, which a city does for a hovering one only. Being a path of the
@@ -38,14 +35,13 @@ from isac_rt.world.swarm import Pose
 
 
 def rayleigh_cells(
-    clutter: Clutter, range_cell: float, reference_range: float, rng: np.random.Generator
+    clutter: Clutter, range_cell: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """One draw of the run.
 
     Parameters
     ----------
     range_cell : [m]
-    reference_range : of the reference path [m], the centre where `clutter.centre` says so
 
     Returns
     -------
@@ -55,20 +51,11 @@ def rayleigh_cells(
     """
     low, high = clutter.cells
     count = int(rng.integers(low, high + 1))
-    drawn = rng.uniform(*clutter.centre_m)
-    centre = (drawn if clutter.centre == "drawn" else reference_range) / range_cell
+    centre = rng.uniform(*clutter.centre_m) / range_cell
     first = max(round(centre - (count - 1) / 2), 1)
-    inside = rng.uniform(-0.5, 0.5, count)
-    ranges = (first + np.arange(count) + (inside if clutter.place == "drawn" else 0.0)) * range_cell
+    ranges = (first + np.arange(count) + rng.uniform(-0.5, 0.5, count)) * range_cell
     white = rng.standard_normal((count, 2)) @ np.array([1, 1j]) / np.sqrt(2)
-    rho = clutter.cell_correlation
-    white[1:] *= np.sqrt(1 - rho**2)
-    mean_power = 10 ** (clutter.level_db / 10) * (
-        4 / np.pi if clutter.level_of == "amplitude" else 1.0
-    )
-    from scipy.signal import lfilter  # dear to import, and few runs draw such clutter
-
-    return ranges, np.sqrt(mean_power) * lfilter([1.0], [1.0, -rho], white)
+    return ranges, 10 ** (clutter.level_db / 20) * white
 
 
 class RayleighClutter:
@@ -85,8 +72,7 @@ class RayleighClutter:
         return self.model.census()
 
     def trace(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Traced:
-        """The model's paths and the clutter's; the draw depends on seed, link and, unless drawn
-        once, epoch."""
+        """The model's paths and the clutter's; the draw depends on seed, link and epoch."""
         paths, dropped = self.model.trace(poses, epoch, links)
         return Traced(
             {link: merge([p, self._scatterers(p, poses)]) for link, p in paths.items()}, dropped
@@ -95,21 +81,11 @@ class RayleighClutter:
     def _scatterers(self, paths: PathSet, poses: dict[str, Pose]) -> PathSet:
         (tx, rx), epoch, own = paths.link, paths.epoch, paths.link.own
         passes = paths.link.passes
-        other = self._reference.strongest_target(poses, tx) if own else rx
-        between = poses[other].position - poses[tx].position
-        distance = float(np.linalg.norm(between))
-        when = "run" if self._clutter.redraw == "once" else repr(float(epoch))
-        rng = generator(self._reference.seed, "rayleigh clutter", tx, rx, when)
-        ranges, amplitudes = rayleigh_cells(
-            self._clutter, self._waveform.range_cell(passes), distance, rng
-        )
-        departure = arrival = np.tile(between / distance, (ranges.size, 1))
+        rng = generator(self._reference.seed, "rayleigh clutter", tx, rx, repr(float(epoch)))
+        ranges, amplitudes = rayleigh_cells(self._clutter, self._waveform.range_cell(passes), rng)
+        departure = arrival = poses[tx].to_world(self._directions(ranges.size, rng))
         if not own:
-            arrival = -departure
-        if self._clutter.direction == "field_of_view":
-            departure = arrival = poses[tx].to_world(self._directions(ranges.size, rng))
-            if not own:
-                arrival = poses[rx].to_world(self._directions(ranges.size, rng))
+            arrival = poses[rx].to_world(self._directions(ranges.size, rng))
         return make_paths(
             gain=self._reference.reference_amplitude(poses, paths.link) * amplitudes,
             delay=passes * ranges / SPEED_OF_LIGHT,
