@@ -184,19 +184,6 @@ def test_halves_of_the_knots_know_nothing_of_each_other(streets):
     assert np.abs(a.mean(axis=0)).max() < 1e-2
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 1000])
-def test_numbers_that_are_alike(count):
-    """The set of them, and each found again, also where hashes collide (multiples of 2^40). Planted
-    bug: the first number in a slot taken for all of that slot."""
-    from isac_rt.propagation.legs.chains import _alike
-
-    rng = np.random.default_rng(count)
-    keys = rng.integers(0, 300, count) << rng.choice([0, 40], count)
-    different, which = _alike(keys)
-    assert sorted(different.tolist()) == sorted(set(keys.tolist()))
-    assert different[which].tolist() == keys.tolist()
-
-
 def test_a_room_has_the_whole_lattice_of_images():
     """A closed room, up to four bounces: 4 n^2 + 2 images of n bounces, at the lattice's places.
     Planted bug: the first plane of a chain for all."""

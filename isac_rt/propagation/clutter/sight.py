@@ -17,7 +17,6 @@ import mitsuba as mi
 import numpy as np
 from scipy.interpolate import BSpline
 
-from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.penumbra import REACH as PENUMBRA
 from isac_rt.propagation.clutter.penumbra import Crossings, Facets, crossings, penumbra
 from isac_rt.propagation.legs.rays import Shadows
@@ -121,19 +120,9 @@ def ever_ahead(fronts: np.ndarray, points: np.ndarray) -> np.ndarray:
     to one that they might between two `LOOKS`."""
     normals, begins, turn = np.split(fronts, [3, 4], axis=1)
     farthest = np.linalg.norm(points, axis=1).max(initial=0.0)
-    return _beyond(np.column_stack([normals, begins - turn * farthest]), points)
-
-
-@jit
-def _beyond(planes, points):
-    """(N,) whether points (N, 3) lie beyond any of planes (S, 4)."""
-    out = np.zeros(len(points), np.bool_)
-    for i in range(len(points)):
-        x, y, z = points[i]
-        for a, b, c, begins in planes:
-            if x * a + y * b + z * c > begins:
-                out[i] = True
-                break
+    out = np.zeros(len(points), bool)
+    for normal, begin in zip(normals, begins - turn * farthest, strict=True):
+        out |= points @ normal > begin
     return out
 
 

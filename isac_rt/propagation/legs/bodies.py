@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isac_rt.kernels.jit import jit
 from isac_rt.propagation.legs.diffraction import LIT_REACH, disc, fresnel_unit, tapered
 from isac_rt.world.settings import Uav
 from isac_rt.world.swarm import Pose
@@ -96,34 +95,28 @@ class Bodies:
         return path
 
 
-@jit
-def _near(starts, ends, before, total, places, radii, spared, wavelength, reach):
-    """Paths, path by path, whose straight part passes a body within its shadow's reach, unless
-    `spared`; the body, the distance of its centre, and that along the path."""
-    which, body = [0 for _ in range(0)], [0 for _ in range(0)]
-    off, along = [0.0 for _ in range(0)], [0.0 for _ in range(0)]
-    for i in range(len(total)):
-        sx, sy, sz = ends[i, 0] - starts[i, 0], ends[i, 1] - starts[i, 1], ends[i, 2] - starts[i, 2]
-        square = sx * sx + sy * sy + sz * sz
-        row = i if len(spared) > 1 else 0
-        for n in range(len(radii)):
-            wx, wy = places[n, 0] - starts[i, 0], places[n, 1] - starts[i, 1]
-            wz, radius = places[n, 2] - starts[i, 2], radii[n]
-            dot = sx * wx + sy * wy + sz * wz
-            if dot <= 0 or dot >= square or spared[row, n]:
-                continue
-            away = wx * wx + wy * wy + wz * wz
-            across = away - dot * dot / square
-            # a Fresnel unit is at most that of an endless path
-            edge = radius + reach * np.sqrt(wavelength * (before[i] + np.sqrt(away) + radius) / 2)
-            if across > edge * edge:
-                continue
-            at = before[i] + dot / np.sqrt(square)
-            near, far = max(at, radius), max(total[i] - at, radius)
-            h = np.sqrt(max(across, 0.0))
-            if h - radius < reach * np.sqrt(wavelength * near * far / (2 * (near + far))):
-                which.append(i)
-                body.append(n)
-                off.append(h)
-                along.append(at)
-    return np.array(which, np.int64), np.array(body, np.int64), np.array(off), np.array(along)
+def _near(
+    starts: np.ndarray,
+    ends: np.ndarray,
+    before: np.ndarray,
+    total: np.ndarray,
+    places: np.ndarray,
+    radii: np.ndarray,
+    spared: np.ndarray,
+    wavelength: float,
+    reach: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Find the paths (K,), path by path, whose straight part passes a body (N,) within `reach`
+    Fresnel units of its edge, unless `spared`; the body, the distance of its centre, and that along
+    the path."""
+    span, to = ends - starts, places - starts[:, None]
+    square = (span**2).sum(axis=1)[:, None]
+    dot = (to @ span[:, :, None])[:, :, 0]
+    across = np.sqrt(np.maximum((to**2).sum(axis=2) - dot**2 / square, 0.0))
+    at = before[:, None] + dot / np.sqrt(square)
+    near = np.maximum(at, radii)
+    far = np.maximum(total[:, None] - at, radii)
+    edge = reach * np.sqrt(wavelength * near * far / (2 * (near + far)))
+    hit = (dot > 0) & (dot < square) & ~spared & (across - radii < edge)
+    which, body = np.nonzero(hit)
+    return which, body, across[hit], at[hit]

@@ -21,7 +21,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from isac_rt.kernels.jit import jit
 from isac_rt.propagation.clutter.sight import Flight
 from isac_rt.propagation.legs.rays import LIFT, rays
 from isac_rt.storage import checksum, kept, pack
@@ -183,9 +182,8 @@ class _Levels:
 
     def grown(self, parent: np.ndarray, plane: np.ndarray) -> np.ndarray:
         """(K,) rows of chains (K,) with a plane more each."""
-        found, numbers = _alike((parent + 1) * self._num_planes + plane)
-        order = np.argsort(found)
-        keys, numbers = found[order], np.argsort(order)[numbers]
+        names = (parent + 1) * self._num_planes + plane
+        keys, numbers = np.unique(names, return_inverse=True)
         before, after = np.divmod(keys, max(self._num_planes, 1))
         self._parents.append(before - 1)
         self._planes.append(after)
@@ -197,30 +195,6 @@ class _Levels:
         """All so far."""
         parent, plane = np.concatenate(self._parents), np.concatenate(self._planes)
         return Chains(parent, plane, np.array(self._first))
-
-
-@jit
-def _alike(keys):
-    """The different ones of numbers >= 0 in the order in which they appear, and for each which it
-    is; a hash takes a tenth of a sort's time where many are alike."""
-    bits = 1
-    while 1 << bits < 2 * keys.size:
-        bits += 1
-    table = np.full(1 << bits, -1)
-    different, which = np.empty(keys.size, np.int64), np.empty(keys.size, np.int64)
-    count = 0
-    for i in range(keys.size):
-        # Knuth's multiplicative hash: the golden ratio's bits
-        slot = (np.uint64(keys[i]) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(64 - bits)
-        at = np.int64(slot)
-        while table[at] >= 0 and different[table[at]] != keys[i]:
-            at = (at + 1) & ((1 << bits) - 1)
-        if table[at] < 0:
-            table[at] = count
-            different[count] = keys[i]
-            count += 1
-        which[i] = table[at]
-    return different[:count], which
 
 
 def directions(count: int, number: int) -> np.ndarray:

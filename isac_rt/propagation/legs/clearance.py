@@ -7,7 +7,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from isac_rt.kernels.jit import jit
 from isac_rt.world.city.mesh import CityMesh, distance_to_triangles
 
 CLEARANCE = 0.01
@@ -45,21 +44,18 @@ class Clearance:
                 )
 
 
-@jit
-def _beside(normals, offsets, low, high, places, most):
-    """Numbers of places (N, 3) and of the faces in whose planes and boxes, but for so much, they
-    lie."""
-    place, face = [0 for _ in range(0)], [0 for _ in range(0)]
-    for f in range(len(offsets)):
-        x, y, z = normals[f, 0], normals[f, 1], normals[f, 2]
-        for k in range(len(places)):
-            height = x * places[k, 0] + y * places[k, 1] + z * places[k, 2] - offsets[f]
-            if abs(height) >= most:
-                continue
-            inside = True
-            for c in range(3):
-                inside &= low[f, c] - most < places[k, c] < high[f, c] + most
-            if inside:
-                place.append(k)
-                face.append(f)
-    return np.array(place, np.int64), np.array(face, np.int64)
+def _beside(
+    normals: np.ndarray,
+    offsets: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    places: np.ndarray,
+    most: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the places (K, 3) and the faces (F,) in whose planes and boxes, but for so much, they
+    lie: numbers of both."""
+    near = np.abs(normals @ places.T - offsets[:, None]) < most
+    face, place = np.nonzero(near)
+    here = places[place]
+    inside = ((low[face] - most < here) & (here < high[face] + most)).all(axis=1)
+    return place[inside], face[inside]

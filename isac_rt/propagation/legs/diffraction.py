@@ -19,8 +19,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import fresnel
 
-from isac_rt.kernels.jit import jit
-
 LIT_REACH = 6.0
 """Fresnel units from the edge of a shadow, on its lit side, at which an obstacle stops to matter;
 its ripple is 4 % there and tapered."""
@@ -62,24 +60,14 @@ def disc(nu: np.ndarray, radius: np.ndarray) -> np.ndarray:
     -------
     (K,) complex128; on the axis exp(-j pi alpha^2 / 2), Poisson's spot
     """
-    return np.asarray(_disc(nu, radius))
-
-
-@jit
-def _disc(nu, radius):
-    out = np.empty(nu.size, np.complex128)
-    for k in range(nu.size):
-        a, v = radius[k], nu[k]
+    out = np.empty(nu.size, complex)
+    for k, (v, a) in enumerate(zip(nu, radius, strict=True)):
         # periodic and smooth: the mean converges at once when phases are resolved
         count = 24 + int(np.ceil(2 * v * a * np.pi))
-        total = 0.0j
-        for i in range(count):
-            cosine = np.cos(np.pi * (i + 0.5) / count)
-            square = max(v * v + a * a + 2 * a * v * cosine, 1e-12)
-            phase = 0.5 * np.pi * square
-            wave = complex(1 - np.cos(phase), np.sin(phase)) / square
-            total += wave * (a * a + a * v * cosine)
-        out[k] = 1 - total / count
+        cosine = np.cos(np.pi * (np.arange(count) + 0.5) / count)
+        square = np.maximum(v * v + a * a + 2 * a * v * cosine, 1e-12)
+        wave = (1 - np.exp(-0.5j * np.pi * square)) / square
+        out[k] = 1 - (wave * (a * a + a * v * cosine)).mean()
     return out
 
 
