@@ -72,7 +72,7 @@ def if_signal(
     >>> from isac_rt.frame.antennas import Antennas
     >>> from isac_rt.frame.payload import unmodulated
     >>> from isac_rt.frame.schedule import conventional_schedule
-    >>> from isac_rt.propagation import make_paths
+    >>> from isac_rt.propagation.pathset import make_paths
     >>> from isac_rt.world.swarm import Pose
     >>> w = irt.Waveform(num_chirps=6, num_groups=1)
     >>> arrays = Antennas(tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=w.wavelength / 2)
