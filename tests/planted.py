@@ -153,7 +153,7 @@ OF_CASES = {
         "np.concatenate(sections))",
     ),
     "lambertian wall": Bug(
-        "propagation/clutter/field.py", "power *= abs(back) / np.pi", "power *= 1 / np.pi"
+        "kernels/propagation_field.py", "power *= abs(back) / np.pi", "power *= 1 / np.pi"
     ),
     "lambertian wall by way of the ground": Bug(
         "propagation/clutter/two_bounces.py",
@@ -205,12 +205,12 @@ OF_CASES = {
         "2 * BOLTZMANN * noise.temperature_k * waveform.sampling_rate *",
     ),
     "phase of scatterers in flight": Bug(
-        "propagation/clutter/field.py",
+        "kernels/propagation_field.py",
         "length[row], rate[row], accel[row] = r1 + r2, v1 + v2, a1 + a2",
         "length[row], rate[row], accel[row] = np.float32(r1 + r2), v1 + v2, a1 + a2",
     ),
     "coherence of the clutter field": Bug(
-        "propagation/clutter/field.py",
+        "kernels/propagation_field.py",
         "length[row], rate[row], accel[row] = r1 + r2, v1 + v2, a1 + a2",
         "length[row], rate[row], accel[row] = 1.00001 * (r1 + r2), v1 + v2, a1 + a2",
     ),
@@ -225,7 +225,7 @@ OF_CASES = {
         "np.ones_like(uniform[0]) *",
     ),
     "doppler of range cells": Bug(
-        "propagation/clutter/field.py",
+        "kernels/propagation_field.py",
         "length[row], rate[row], accel[row] = r1 + r2, v1 + v2, a1 + a2",
         "length[row], rate[row], accel[row] = 1.5 * (r1 + r2), v1 + v2, a1 + a2",
     ),
@@ -235,7 +235,7 @@ OF_CASES = {
         "most = eased * error * (1 + clutter)",
     ),
     "mean power of a street": Bug(
-        "propagation/clutter/field.py",
+        "kernels/propagation_field.py",
         "power *= abs(back) / np.pi",
         "power *= 1.03 * abs(back) / np.pi",
     ),

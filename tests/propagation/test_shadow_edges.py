@@ -14,10 +14,11 @@ from test_diffraction import chopped
 
 from isac_rt import scenario
 from isac_rt.frame.link import Link
+from isac_rt.kernels.propagation_edges import near
 from isac_rt.propagation.legs import edges as edges_of_cities
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.direct import direct_legs
-from isac_rt.propagation.legs.edges import MOST_TRIED, Edges, _near
+from isac_rt.propagation.legs.edges import MOST_TRIED, Edges
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in
@@ -286,6 +287,6 @@ def test_no_edge_near_a_path_is_passed_over(together, monkeypatch):
             low, high = np.where(left, low, one), np.where(left, other, high)
         every = np.sort(detour(low).ravel())
         every = every[every < reach][:MOST_TRIED]
-        assert _near(edges, source, sink, reach)[0] == pytest.approx(every, abs=1e-9)
+        assert near(edges, source, sink, reach)[0] == pytest.approx(every, abs=1e-9)
         found += every.size
     assert found > 300

@@ -84,9 +84,7 @@ class Bodies:
     ) -> np.ndarray:
         """Multiply `out` by the factors of straight parts that begin `before` along paths of length
         `total`; the paths that a body is near, once for each."""
-        path, body, off, along = _near(
-            starts, ends, before, total, self.places, self.radii, spared, wavelength, LIT_REACH
-        )
+        path, body, off, along = self._near(starts, ends, before, total, wavelength, spared)
         radius = self.radii[body]
         far = np.maximum(total[path] - along, radius)  # nearer than its own size a disc is none
         unit = fresnel_unit(wavelength, np.maximum(along, radius), far)
@@ -94,29 +92,27 @@ class Bodies:
         np.multiply.at(out, path, tapered(disc(nu, size), nu - size))
         return path
 
-
-def _near(
-    starts: np.ndarray,
-    ends: np.ndarray,
-    before: np.ndarray,
-    total: np.ndarray,
-    places: np.ndarray,
-    radii: np.ndarray,
-    spared: np.ndarray,
-    wavelength: float,
-    reach: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Find the paths (K,), path by path, whose straight part passes a body (N,) within `reach`
-    Fresnel units of its edge, unless `spared`; the body, the distance of its centre, and that along
-    the path."""
-    span, to = ends - starts, places - starts[:, None]
-    square = (span**2).sum(axis=1)[:, None]
-    dot = (to @ span[:, :, None])[:, :, 0]
-    across = np.sqrt(np.maximum((to**2).sum(axis=2) - dot**2 / square, 0.0))
-    at = before[:, None] + dot / np.sqrt(square)
-    near = np.maximum(at, radii)
-    far = np.maximum(total[:, None] - at, radii)
-    edge = reach * np.sqrt(wavelength * near * far / (2 * (near + far)))
-    hit = (dot > 0) & (dot < square) & ~spared & (across - radii < edge)
-    which, body = np.nonzero(hit)
-    return which, body, across[hit], at[hit]
+    def _near(
+        self,
+        starts: np.ndarray,
+        ends: np.ndarray,
+        before: np.ndarray,
+        total: np.ndarray,
+        wavelength: float,
+        spared: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Find the paths (K,), path by path, whose straight part passes a body (N,) within
+        `LIT_REACH` Fresnel units of its edge, unless `spared`; the body, the distance of its
+        centre, and that along the path."""
+        places, radii = self.places, self.radii
+        span, to = ends - starts, places - starts[:, None]
+        square = (span**2).sum(axis=1)[:, None]
+        dot = (to @ span[:, :, None])[:, :, 0]
+        across = np.sqrt(np.maximum((to**2).sum(axis=2) - dot**2 / square, 0.0))
+        at = before[:, None] + dot / np.sqrt(square)
+        near = np.maximum(at, radii)
+        far = np.maximum(total[:, None] - at, radii)
+        edge = LIT_REACH * np.sqrt(wavelength * near * far / (2 * (near + far)))
+        hit = (dot > 0) & (dot < square) & ~spared & (across - radii < edge)
+        which, body = np.nonzero(hit)
+        return which, body, across[hit], at[hit]

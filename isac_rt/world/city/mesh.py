@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isac_rt.kernels.jit import jit
+from isac_rt.kernels.world_mesh import group_planes as _group_planes
 from isac_rt.storage import kept
 from isac_rt.world.city.materials import CityError, Material, MaterialUse
 from isac_rt.world.city.place import Place
@@ -20,8 +20,6 @@ from isac_rt.world.city.place import Place
 _LOG = logging.getLogger(__name__)
 PLANE_TOLERANCE = 1e-6
 """Two faces share a plane if all corners of one lie this close to the plane of the other. [m]"""
-TOGETHER = 64
-"""Faces that are asked for a plane at once: most are nowhere near it."""
 FACES_KEPT = 3000
 """The planes of fewer faces are found in less time than it takes to read them."""
 MAX_FACES = 10_000_000
@@ -217,56 +215,6 @@ class CityMesh:
 def _read_only(array: NDArray) -> NDArray:
     array.setflags(write=False)
     return array
-
-
-@jit
-def _group_planes(
-    corners: NDArray, normals: NDArray, offsets: NDArray, tolerance: float
-) -> NDArray:
-    """Plane id per face; faces come sorted by falling area."""
-    count = len(corners)
-    plane = np.full(count, -1, dtype=np.int64)
-    left = np.arange(count)
-    # one corner decides most
-    x, y, z = corners[:, 0, 0].copy(), corners[:, 0, 1].copy(), corners[:, 0, 2].copy()
-    num_open, num_planes = count, 0
-    for seed in range(count):
-        if plane[seed] >= 0:
-            continue
-        plane[seed] = num_planes
-        num_open -= 1
-        nx, ny, nz = normals[seed]
-        d = offsets[seed]
-        for start in range(0, left.size, TOGETHER):
-            some = slice(start, start + TOGETHER)
-            if not _count_near(x[some], y[some], z[some], nx, ny, nz, d, 2 * tolerance):
-                continue
-            for face in left[some]:
-                if plane[face] >= 0:
-                    continue
-                inside = True
-                for k in range(3):
-                    a, b, c = corners[face, k]
-                    inside = inside and abs(nx * a + ny * b + nz * c - d) <= tolerance
-                if inside:
-                    plane[face] = num_planes
-                    num_open -= 1
-        num_planes += 1
-        if 8 * num_open < 7 * left.size:
-            still = plane[left] < 0
-            left, x, y, z = left[still], x[still], y[still], z[still]
-    return plane
-
-
-@jit(fast=True)  # type: ignore[untyped-decorator]  # numba has no types
-def _count_near(
-    x: NDArray, y: NDArray, z: NDArray, nx: float, ny: float, nz: float, d: float, most: float
-) -> int:
-    """How many points are near a plane, but for rounding; the compiler takes many at once."""
-    count = 0
-    for i in range(x.size):
-        count += abs(nx * x[i] + ny * y[i] + nz * z[i] - d) <= most
-    return count
 
 
 def empty_city(name: str, origin: NDArray[np.float64]) -> CityMesh:
