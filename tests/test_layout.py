@@ -212,3 +212,44 @@ def test_no_registry_address_in_the_set_up():
     root = PACKAGE.parent
     for name in ("requirements.lock", "pyproject.toml", "Makefile", ".ci/run"):
         assert "://" not in (root / name).read_text(), name
+
+
+@pytest.mark.parametrize("path", [m for m in MODULES if room_of(m) != "kernels"], ids=ids)
+def test_compiled_functions_stand_in_their_room(path: Path):
+    """Planted bug: `@jit` before a function of receive/cfar.py."""
+    decorators = [
+        ast.unparse(decorator)
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef)
+        for decorator in node.decorator_list
+    ]
+    assert not [name for name in decorators if "jit" in name]
+
+
+MAX_LINES = {
+    "kernels": 4650,
+    "frame": 2000,
+    "world": 5600,
+    "hardware": 1300,
+    "propagation": 5000,
+    "signal": 1500,
+    "receive": 7800,
+    "track": 4900,
+    "access": 1850,
+    "scenario": 1550,
+    "results": 3450,
+    "capture": 1900,
+    "simulation": 3400,
+    "sweep": 2350,
+    "views": 3100,
+    "cli": 2100,
+}
+"""Lines of each room, which only go down."""
+
+
+@pytest.mark.parametrize("room", MAX_LINES)
+def test_rooms_do_not_grow(room: str):
+    """Planted bug: a room that is left out of the table."""
+    lines = sum(m.read_text().count("\n") for m in MODULES if room_of(m) == room)
+    assert 0 < lines <= MAX_LINES[room]
+    assert MAX_LINES.keys() == set(ORDER) - set(GROUND_FILES)
