@@ -14,11 +14,11 @@ from test_diffraction import chopped
 
 from isac_rt import scenario
 from isac_rt.frame.link import Link
-from isac_rt.kernels.propagation_edges import near
+from isac_rt.kernels.propagation_edges import MOST_TRIED, near
 from isac_rt.propagation.legs import edges as edges_of_cities
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.direct import direct_legs
-from isac_rt.propagation.legs.edges import MOST_TRIED, Edges
+from isac_rt.propagation.legs.edges import Edges
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in

@@ -42,7 +42,8 @@ from scipy.spatial import cKDTree
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
-from isac_rt.kernels.propagation_field import advance as _advance
+from isac_rt.kernels import propagation_field
+from isac_rt.kernels.jit import twin_of
 from isac_rt.plain import plain
 from isac_rt.propagation.clutter.cells import MOST_CELLS, Cells, Density, cut, error_for
 from isac_rt.propagation.clutter.merging import Heard, NoiseFloor, covered, resolution_cell
@@ -123,6 +124,79 @@ class Rows(NamedTuple):
     arrival: np.ndarray
     cell: np.ndarray
     magnitude: np.ndarray
+
+
+@twin_of(propagation_field.advance)
+def advance(
+    surfaces: Surfaces,
+    points: np.ndarray,
+    face: np.ndarray,
+    area: np.ndarray,
+    share: np.ndarray,
+    scale: float,
+    start: np.ndarray,
+    end: np.ndarray,
+    own: bool,
+    rows: Rows,
+) -> None:
+    """Fill all rows (K,) but `cell`: path length, its rate and acceleration, directions towards the
+    cells, and the square root of the mean power gain. `start`, `end` (3, 3): position, velocity,
+    acceleration of the ends; `own`: both are one."""
+    i = rows.cell
+    n, first = surfaces.normals[face[i]], _motion_to(points[i], start)
+    last = first if own else _motion_to(points[i], end)
+    for out, there, back in zip(rows[:3], first, last, strict=False):
+        out[:] = there + back
+    rows.tx_radius[:], rows.rx_radius[:] = first[0], last[0]
+    rows.departure[:], rows.arrival[:] = first[3], last[3]
+    u, v = first[3], last[3]
+    into, back = (u * n).sum(axis=1), (v * n).sum(axis=1)
+    # TE is along u x n, of which the vertical field holds its part across the horizontal u x z
+    whole = (u[:, 0] ** 2 + u[:, 1] ** 2) * (1 - np.minimum(np.abs(into), 1.0) ** 2)
+    across = (n[:, 1] * u[:, 0] - n[:, 0] * u[:, 1]) ** 2
+    part = np.where(whole > 1e-12, np.minimum(across / np.maximum(whole, 1e-12), 1.0), 0.5)
+    power = scattered_power(surfaces, face[i], area[i], into, back, (u * v).sum(axis=1), part)
+    gain = scale * share[i] * np.sqrt(np.maximum(power, 0.0)) / (first[0] * last[0])
+    rows.magnitude[:] = np.where(into * back > 0, gain, 0.0)
+
+
+def _motion_to(points: np.ndarray, body: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Distance (K,) of a moving body (3, 3) from points (K, 3), its rate and acceleration, and the
+    unit vectors towards the points."""
+    place, velocity, acceleration = body
+    r = np.linalg.norm(points - place, axis=1)
+    u = (points - place) / r[:, None]
+    rate = -u @ velocity
+    return r, rate, (velocity @ velocity - rate**2) / r - u @ acceleration, u
+
+
+def scattered_power(
+    surfaces: Surfaces,
+    face: np.ndarray,
+    area: np.ndarray,
+    into: np.ndarray,
+    back: np.ndarray,
+    between: np.ndarray,
+    part: np.ndarray,
+) -> np.ndarray:
+    """Power (K,) that cells scatter into a direction, per steradian and unit of power density: the
+    integrand of effective roughness without its distances.
+
+    `into` and `back` are the cosines of incidence and departure with signs, `between` that of the
+    angle between them, `part` the share of the field that is TE.
+    """
+    m, grid = surfaces.material[face], np.linspace(0, 1, surfaces.table.shape[1])
+    cosine = np.minimum(np.abs(into), 1.0)
+    te, tm, norm = np.empty((3, cosine.size))
+    for one in np.unique(m):
+        for out, column in zip((te, tm, norm), surfaces.table[one].T, strict=True):
+            out[m == one] = np.interp(cosine[m == one], grid, column)
+    lobe, exponent = surfaces.lobe[m], surfaces.exponent[m]
+    mirror = np.maximum(0.5 * (1 + 2 * into * back - between), 0.0) ** exponent
+    source = np.maximum(0.5 * (1 + between), 0.0) ** exponent
+    directive = (lobe * mirror + (1 - lobe) * source) * norm
+    power = surfaces.coefficient[m] * (part * te + (1 - part) * tm) * cosine * area
+    return power * np.where(lobe < 0, np.abs(back) / np.pi, directive)
 
 
 class Scatterers(NamedTuple):
@@ -343,7 +417,7 @@ class ClutterField:
         )
         rows, motion = Rows(*vars(found).values()), (start.motion(), end.motion())
         c = cells
-        _advance(self.surfaces, c.points, c.face, c.area, share, self._scale, *motion, own, rows)
+        advance(self.surfaces, c.points, c.face, c.area, share, self._scale, *motion, own, rows)
         return found
 
     def paths(self, state: LinkState, antennas: Antennas, bodies: Bodies | None = None) -> PathSet:

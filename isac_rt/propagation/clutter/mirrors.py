@@ -20,7 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isac_rt.kernels.propagation_mirrors import on_the_wall as _on_the_wall
+from isac_rt.kernels import propagation_mirrors
+from isac_rt.kernels.jit import twin_of
+from isac_rt.kernels.propagation_mirrors import APART
 from isac_rt.kernels.propagation_rays import LIFT
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.clutter.sight import Flight
@@ -139,7 +141,7 @@ def shown(
 
     The wave must meet the mirror on one of its faces, and both legs must be free.
     """
-    found = [_on_the_wall(points, place, m.normal, m.offset, m.corners) for m in mirrors]
+    found = [on_the_wall(points, place, m.normal, m.offset, m.corners) for m in mirrors]
     which = np.concatenate([f[0] for f in found])
     if not which.size:
         return [f[0] for f in found]
@@ -153,3 +155,27 @@ def shown(
     free[left] = shadows.clear(here + LIFT * own, there + LIFT * wall[left])
     ends = np.cumsum([f[0].size for f in found])
     return [f[0][part] for f, part in zip(found, np.split(free, ends[:-1]), strict=True)]
+
+
+@twin_of(propagation_mirrors.on_the_wall)
+def on_the_wall(
+    points: np.ndarray, place: np.ndarray, normal: np.ndarray, offset: float, corners: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the points (N, 3) on the viewer's side of a mirror whose way to it from a place (3,)
+    meets one of its triangles (T, 3, 3): their numbers, and where.
+
+    The image of a point lies as far behind the wall as the point before it.
+    """
+    above, up = normal @ place - offset, points @ normal - offset
+    same = (up * above > 0) & (np.abs(up) >= APART) & (np.abs(above) >= APART)
+    which = np.flatnonzero(same).astype(np.int32)
+    up = up[which]
+    share = above / (above + up)
+    foot = place - above * normal
+    met = foot + share[:, None] * (points[which] - up[:, None] * normal - foot)
+    edges = np.roll(corners, -1, axis=1) - corners
+    turns = np.cross(edges, met[:, None, None] - corners) @ normal
+    inside = ((turns >= -1e-9).all(axis=2) | (turns <= 1e-9).all(axis=2)).any(axis=1)
+    low, high = corners.min(axis=(0, 1)) - 1e-6, corners.max(axis=(0, 1)) + 1e-6
+    inside &= ((met >= low) & (met <= high)).all(axis=1)
+    return which[inside], met[inside]

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isac_rt.kernels.world_mesh import group_planes as _group_planes
+from isac_rt.kernels import world_mesh
+from isac_rt.kernels.jit import twin_of
 from isac_rt.storage import kept
 from isac_rt.world.city.materials import CityError, Material, MaterialUse
 from isac_rt.world.city.place import Place
@@ -150,7 +151,7 @@ class CityMesh:
         _LOG.info("finding the planes of %s faces", f"{self.num_faces:,}")
         order = np.argsort(-self.areas, kind="stable")
         planes = np.empty(self.num_faces, dtype=np.int64)
-        planes[order] = _group_planes(
+        planes[order] = group_planes(
             self.corners[order],
             self.normals[order],
             self.plane_offsets[order],
@@ -375,3 +376,23 @@ def clean(
         )
     used, index = np.unique(faces, return_inverse=True)
     return local[used], index.reshape(-1, 3).astype(np.int32), owner, notes, tolerance
+
+
+@twin_of(world_mesh.group_planes)
+def group_planes(
+    corners: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    offsets: NDArray[np.float64],
+    tolerance: float,
+) -> NDArray[np.int64]:
+    """Group faces (F, 3, 3), sorted by falling area, by plane: the largest that is left takes all
+    whose corners lie this close to its plane. Numbers (F,) of the planes."""
+    plane = np.full(len(corners), -1, np.int64)
+    for seed in range(len(corners)):
+        if plane[seed] < 0:
+            left = np.flatnonzero(plane < 0)
+            near = np.abs(corners[left] @ normals[seed] - offsets[seed]) <= tolerance
+            number = plane.max() + 1
+            plane[left[near.all(axis=1)]] = number
+            plane[seed] = number
+    return plane
