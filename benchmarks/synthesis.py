@@ -53,8 +53,8 @@ GRIDS = (
 REAL: dict[str, dict[str, Any]] = {
     "oscillators": {"preset": "pll_good"},
     "elements": {
-        "transmit": {"gain_std_db": 1, "delay_std_ps": 5, "tilt_std_deg": 1, "coupling_db": -25},
-        "receive": {"gain_std_db": 1, "delay_std_ps": 5, "tilt_std_deg": 1, "coupling_db": -25},
+        "transmit": {"gain_std_db": 1, "delay_std_ps": 5, "coupling_db": -25},
+        "receive": {"gain_std_db": 1, "delay_std_ps": 5, "coupling_db": -25},
     },
     "responses": {
         "transmit_response": {"table_db": [0, -1, -3]},

@@ -21,6 +21,7 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.payload import MODULATION_ORDERS, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.hardware.converter import HEADROOM_DB
 from isac_rt.hardware.front_end import IDEAL, Ends, front_end_of
 from isac_rt.hardware.front_end import FrontEnd as Built
 from isac_rt.hardware.oscillator import Mask
@@ -170,7 +171,7 @@ def _floor_truth(one: Beside, power: np.ndarray, delays: np.ndarray, w: Waveform
     """Noise of the range cells over the thermal noise."""
     node, truth = one.node, 1.0
     if node.converter.bits:
-        full = 10 ** (node.converter.headroom_db / 10) * (power.sum() + 1)
+        full = 10 ** (HEADROOM_DB / 10) * (power.sum() + 1)
         truth += full * 2 / 3 / 4**node.converter.bits
     if not node.oscillator.ideal:
         mask = Mask(node.oscillator.mask_dbc_hz, node.oscillator.locked)

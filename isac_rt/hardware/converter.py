@@ -29,6 +29,9 @@ from isac_rt.hardware import settings
 
 _AT_ONE_DB = np.sqrt(10**0.2 - 1)  # power over the saturation's where the gain is 1 dB lower
 
+HEADROOM_DB = 12.0
+"""Full scale of the automatic gain over the mean power: room for four equal waves."""
+
 
 def watts(dbm: float) -> float:
     """Power [W]."""
@@ -71,7 +74,7 @@ def converter_of(o: settings.Converter) -> Converter | None:
         o.real,
         o.bits or 0,
         0.0 if o.full_scale_dbm is None else float(np.sqrt(watts(o.full_scale_dbm))),
-        10 ** (o.headroom_db / 20),
+        10 ** (HEADROOM_DB / 20),
     )
 
 

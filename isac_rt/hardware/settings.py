@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from isac_rt.settings import Decibels, Finite, Node, Problem, Vector
+from isac_rt.settings import Decibels, Finite, Node, Problem
 
 Offset = Annotated[float, Field(ge=1e-3, le=1e12, allow_inf_nan=False)]
 
@@ -66,29 +66,31 @@ Power = Annotated[float, Field(ge=-200, le=100, allow_inf_nan=False)]
 """Powers in dBm between that of a noiseless receiver's hum and ten megawatts."""
 Picoseconds = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
 """A delay of 100 ns is 15 m of cable; more is no error of an antenna."""
-Part = tuple[Finite, Finite]
 
 
 class Elements(Node):
     """Errors of the elements of one array: what is stated of each, and what is drawn for each."""
 
+    REMOVED: ClassVar[dict[str, str]] = {
+        "common_delay_ps": "delay_ps with one value, which is that of all elements",
+        "position_mm": "delay_ps, or the places as they are in array.tx and array.rx",
+        "position_std_mm": "delay_std_ps: 3.3 ps are a millimetre",
+        "tilt_deg": "leave it out: all elements look ahead",
+        "tilt_std_deg": "leave it out: all elements look ahead; gain_std_db scatters their gains",
+        "gain_drift_std_db_per_s": "leave it out: errors stay as they are drawn",
+        "phase_drift_std_deg_per_s": "leave it out: errors stay as they are drawn",
+        "coupling": "coupling_db, the level of the two nearest elements",
+    }
+
     gain_db: tuple[Gain, ...] = ()
-    """Gain of each element over what it should be [dB], in the order of the elements. Empty, the
-    default: 0."""
+    """Gain of each element over what it should be [dB], in the order of the elements; one value is
+    that of all. Empty, the default: 0."""
     phase_deg: tuple[Degrees, ...] = ()
-    """Phase that each element adds to its IF samples [degrees]. Empty, the default: 0."""
+    """Phase that each element adds to its IF samples [degrees]; one value is that of all. Empty,
+    the default: 0."""
     delay_ps: tuple[Picoseconds, ...] = ()
     """Delay of each element's line [ps]: it shifts the range of what the element hears or sends.
-    Empty, the default: 0."""
-    common_delay_ps: Picoseconds = 0.0
-    """Delay that all elements have more [ps], such as that of a board: a bias of all ranges. By
-    default none."""
-    position_mm: tuple[Vector, ...] = ()
-    """How far each element is from where it should be, in body axes [mm]. Empty, the default:
-    nowhere."""
-    tilt_deg: tuple[Part, ...] = ()
-    """Turn of each element's pattern [degrees], to the right and upwards. Empty, the default: all
-    look ahead."""
+    One value is that of all, such as of a board: a bias of all ranges. Empty, the default: 0."""
     gain_std_db: GainSpread = 0.0
     """Standard deviation of gains that are drawn for each element once a run [dB]; they add to
     those stated. By default none."""
@@ -96,59 +98,37 @@ class Elements(Node):
     """The same for phases [degrees]. By default none."""
     delay_std_ps: Spread = 0.0
     """The same for delays [ps]. By default none."""
-    position_std_mm: Spread = 0.0
-    """The same for places, along each axis [mm]. By default none."""
-    tilt_std_deg: Spread = 0.0
-    """The same for the turns of patterns, to both sides [degrees]. By default none."""
-    gain_drift_std_db_per_s: GainSpread = 0.0
-    """Standard deviation of the rates at which gains change from the start of the run on [dB/s],
-    one rate for each element; by 60 dB at most. By default they stay."""
-    phase_drift_std_deg_per_s: Spread = 0.0
-    """The same for phases [degrees/s]. By default they stay."""
     coupling_db: Annotated[float, Field(ge=-400, le=-3, allow_inf_nan=False)] | None = None
     """Level at which the two nearest elements couple [dB]; between others it falls with the square
     of the distance, and its phase is that of the way. null, the default: no coupling."""
-    coupling: tuple[tuple[Part, ...], ...] = ()
-    """Coupling matrix in place of that: row by row, of each entry [real, imaginary], of waves at
-    the carrier, ones on the diagonal included. Empty, the default: as `coupling_db` says."""
 
     @property
     def ideal(self) -> bool:
         """Whether all elements are as they should be."""
         return self == Elements()
 
-    def problems(self) -> Iterator[Problem]:
-        if self.coupling and self.coupling_db is not None:
-            said = "the matrix says how elements couple; remove coupling_db or the matrix"
-            yield Problem((("coupling",), ("coupling_db",)), said)
-
     def counts(self) -> Iterator[tuple[str, int]]:
         """Keys that state something of each element, and of how many."""
-        for name in ("gain_db", "phase_deg", "delay_ps", "position_mm", "tilt_deg", "coupling"):
-            if stated := getattr(self, name):
+        for name in ("gain_db", "phase_deg", "delay_ps"):
+            if len(stated := getattr(self, name)) > 1:
                 yield name, len(stated)
-        for row in self.coupling:
-            yield "coupling", len(row)
 
 
 class Response(Node):
     """Complex gain over the sampled part of the chirp, from its beginning to its end."""
+
+    REMOVED: ClassVar[dict[str, str]] = {
+        "polynomial_db": "table_db, which for a straight line has two values",
+        "polynomial_deg": "table_deg, which for a straight line has two values",
+        "element_tables_db": "slope_std_db, by which elements differ",
+        "element_tables_deg": "slope_std_deg, by which elements differ",
+    }
 
     table_db: tuple[Gain, ...] = ()
     """Gain at places evenly spread over the samples of a chirp, the first and the last among them
     [dB]; straight lines between them. Empty, the default: 0."""
     table_deg: tuple[Degrees, ...] = ()
     """The same for the phase of the IF samples [degrees]. Empty, the default: none."""
-    polynomial_db: tuple[Finite, ...] = ()
-    """Coefficients of a polynomial that adds to it [dB], the constant first, in a variable that
-    goes from -1 to 1 over the samples of a chirp. Empty, the default: 0."""
-    polynomial_deg: tuple[Finite, ...] = ()
-    """The same for the phase of the IF samples [degrees]. Empty, the default: none."""
-    element_tables_db: tuple[tuple[Gain, ...], ...] = ()
-    """The same for each element, which adds to what all have in common: a table for each, in the
-    order of the elements. Empty, the default: all elements are alike."""
-    element_tables_deg: tuple[tuple[Degrees, ...], ...] = ()
-    """The same for the phases of each [degrees]. Empty, the default: all elements are alike."""
     slope_std_db: GainSpread = 0.0
     """Standard deviation of slopes that are drawn for each element [dB from the middle of the
     chirp to its end]. By default all elements are alike."""
@@ -164,28 +144,12 @@ class Response(Node):
     @property
     def differs(self) -> bool:
         """Whether elements have responses of their own."""
-        drawn = self.slope_std_db or self.slope_std_deg
-        return bool(drawn or self.element_tables_db or self.element_tables_deg)
-
-    def counts(self) -> Iterator[tuple[str, int]]:
-        """Keys that state something of each element, and of how many."""
-        for name in ("element_tables_db", "element_tables_deg"):
-            if stated := getattr(self, name):
-                yield name, len(stated)
+        return bool(self.slope_std_db or self.slope_std_deg)
 
     def problems(self) -> Iterator[Problem]:
         for name in ("table_db", "table_deg"):
             if len(getattr(self, name)) == 1:
                 yield Problem(((name,),), "one value is no table over the chirp; give two or more")
-        for name in ("element_tables_db", "element_tables_deg"):
-            for i, row in enumerate(getattr(self, name)):
-                if len(row) < 2:
-                    said = f"{len(row)} values are no table over the chirp; give two or more"
-                    yield Problem(((name, i),), said)
-        for name, most in (("polynomial_db", GREATEST_DB), ("polynomial_deg", 3600.0)):
-            if sum(map(abs, getattr(self, name))) > most:
-                said = f"goes beyond {most:g} at the ends, -1 and 1, of the chirp; give less"
-                yield Problem(((name,),), said)
 
 
 FARTHEST_HZ = 1e8
@@ -196,27 +160,25 @@ class Ramp(Node):
     """How far the chirp's frequency is from a straight line: the error of the beat grows with the
     delay."""
 
+    REMOVED: ClassVar[dict[str, str]] = {
+        "cubic_hz": "quadratic_hz and ripple_hz",
+        "ripple_period_s": "leave it out: it is 10e-6, that of a loop of 100 kHz",
+    }
+
     quadratic_hz: Finite = 0.0
     """Frequency error at both ends of the chirp that grows with the square of the time from its
     middle [Hz]. By default none."""
-    cubic_hz: Finite = 0.0
-    """Frequency error at the end of the chirp that grows with the cube of that time [Hz]. By
-    default none."""
     ripple_hz: Finite = 0.0
-    """Swing of a sinusoidal frequency error [Hz]. By default none."""
-    ripple_period_s: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 10e-6
-    """Period of the ripple [s]. The default is that of a synthesiser's loop of 100 kHz."""
+    """Swing of a sinusoidal frequency error [Hz], of a period of 10 us: that of a synthesiser's
+    loop of 100 kHz. By default none."""
 
     @property
     def ideal(self) -> bool:
         """Whether the frequency is a straight line."""
-        return not (self.quadratic_hz or self.cubic_hz or self.ripple_hz)
-
-    def applies(self, name: str) -> bool:
-        return name != "ripple_period_s" or self.ripple_hz != 0
+        return not (self.quadratic_hz or self.ripple_hz)
 
     def problems(self) -> Iterator[Problem]:
-        for name in ("quadratic_hz", "cubic_hz", "ripple_hz"):
+        for name in ("quadratic_hz", "ripple_hz"):
             if not abs(getattr(self, name)) <= FARTHEST_HZ:
                 said = f"is no error of a ramp but another one; at most {FARTHEST_HZ:g} Hz"
                 yield Problem(((name,),), said)
@@ -256,6 +218,10 @@ class Converter(Node):
     """What the receiver does behind its antennas: amplifier, mixer, converters, on signal and noise
     alike."""
 
+    REMOVED: ClassVar[dict[str, str]] = {
+        "headroom_db": "leave it out: the automatic gain leaves 12 dB; or full_scale_dbm fixes it"
+    }
+
     compression_dbm: Power | None = None
     """Power at the receiver's input at which its gain is 1 dB lower [dBm]. null, the default: the
     amplifier is linear."""
@@ -273,11 +239,8 @@ class Converter(Node):
     """Bits of each converter. null, the default: neither quantisation nor saturation."""
     full_scale_dbm: Power | None = None
     """Power at the input of a sine that just fills the converters [dBm]. null, the default: an
-    automatic gain sets it by `headroom_db` over the mean power of the strongest element in a chirp
-    before the frame's first."""
-    headroom_db: Annotated[float, Field(ge=-40, le=80, allow_inf_nan=False)] = 12.0
-    """Full scale of the automatic gain over that mean power [dB]. The default leaves room for four
-    equal waves."""
+    automatic gain sets it 12 dB over the mean power of the strongest element in a chirp before the
+    frame's first, which leaves room for four equal waves."""
 
     @property
     def ideal(self) -> bool:
@@ -285,8 +248,6 @@ class Converter(Node):
         return self == Converter()
 
     def applies(self, name: str) -> bool:
-        if name == "headroom_db":
-            return self.bits is not None and self.full_scale_dbm is None
         return name != "full_scale_dbm" or self.bits is not None
 
     def problems(self) -> Iterator[Problem]:
@@ -318,8 +279,8 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "pll_poor": {"oscillator": {"mask_dbc_hz": [[3e5, -80.0], [1e7, -110.5]]}},
     "awr1443": {
         "oscillator": {"mask_dbc_hz": _AWR_MASK},
-        "transmit": {"gain_std_db": 1.0, "phase_std_deg": 1.4, "common_delay_ps": 228.0},
-        "receive": {"gain_std_db": 1.0, "phase_std_deg": 1.4, "common_delay_ps": 228.0},
+        "transmit": {"gain_std_db": 1.0, "phase_std_deg": 1.4, "delay_ps": [228.0]},
+        "receive": {"gain_std_db": 1.0, "phase_std_deg": 1.4, "delay_ps": [228.0]},
         "transmit_response": {"slope_std_deg": 1.6},
         "receive_response": {"slope_std_deg": 1.6},
     },
@@ -327,8 +288,8 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "oscillator": {"mask_dbc_hz": _AWR_MASK},
         "transmit": {"gain_std_db": 0.68, "phase_std_deg": 1.4},
         "receive": {"gain_std_db": 1.0, "phase_std_deg": 1.4},
-        "transmit_response": {"polynomial_db": [0.0, -0.6]},
-        "receive_response": {"polynomial_db": [0.0, -0.6]},
+        "transmit_response": {"table_db": [0.6, -0.6]},
+        "receive_response": {"table_db": [0.6, -0.6]},
         "shifter": {"bits": 6, "errors_deg": _AWR2243_SHIFTER_DEG, "errors_std_deg": 2.2},
     },
 }

@@ -32,7 +32,7 @@ class Response:
 
     Attributes
     ----------
-    of : the stated table and polynomial
+    of : the stated table
     slopes : (L,) complex128, of the logarithm from the middle of the chirp to its end
     """
 
@@ -42,29 +42,18 @@ class Response:
     @property
     def common(self) -> bool:
         """Whether all elements have the same."""
-        return not (self.slopes.any() or self.of.element_tables_db or self.of.element_tables_deg)
+        return not self.slopes.any()
 
     def at(self, place: np.ndarray) -> np.ndarray:
         """Gain of the elements at places from -1 to 1 over the samples: (L, ...) complex128. Beyond
         the ends a table is held."""
         o, x = self.of, np.asarray(place, float)
         db, deg = np.zeros(x.shape), np.zeros(x.shape)
-        for total, table, polynomial in (
-            (db, o.table_db, o.polynomial_db),
-            (deg, o.table_deg, o.polynomial_deg),
-        ):
+        for total, table in ((db, o.table_db), (deg, o.table_deg)):
             if table:
                 total += np.interp(x, np.linspace(-1, 1, len(table)), table)
-            if polynomial:
-                total += np.polynomial.polynomial.polyval(x, polynomial)
         exponent = db * (np.log(10) / 20) + 1j * np.radians(deg)
         exponent = exponent + np.multiply.outer(self.slopes, x)
-        for tables, unit in (
-            (o.element_tables_db, np.log(10) / 20),
-            (o.element_tables_deg, 1j * np.pi / 180),
-        ):
-            for own, table in zip(exponent, tables, strict=False):
-                own += unit * np.interp(x, np.linspace(-1, 1, len(table)), table)
         return np.exp(exponent)
 
 
@@ -86,19 +75,22 @@ def response_of(o: settings.Response, size: int, seed: int, *name: str) -> Respo
     return Response(o, slopes)
 
 
+RIPPLE_S = 10e-6
+"""Period of a ramp's ripple: that of a synthesiser's loop of 100 kHz."""
+
+
 @dataclass(frozen=True)
 class Ramp:
     """Errors of a chirp's frequency.
 
     Attributes
     ----------
-    quadratic, cubic : at the ends of the chirp [Hz]
+    quadratic : at the ends of the chirp [Hz]
     ripple, period : swing [Hz] and period [s] of a sine from the start of the chirp on
     duration : of the chirp [s]
     """
 
     quadratic: float
-    cubic: float
     ripple: float
     period: float
     duration: float
@@ -107,22 +99,21 @@ class Ramp:
         """e at times since the start of the chirp [Hz]."""
         x = 2 * time / self.duration - 1
         wave = self.ripple * np.sin(2 * np.pi * time / self.period)
-        return x * x * (self.quadratic + self.cubic * x) + wave
+        return self.quadratic * x * x + wave
 
     def cycles(self, time: np.ndarray) -> np.ndarray:
         """Its integral from the middle of the chirp on [cycles]."""
         x, half = 2 * time / self.duration - 1, self.duration / 2
         wave = np.cos(np.pi * self.duration / self.period) - np.cos(2 * np.pi * time / self.period)
         wave = wave * self.ripple * self.period / (2 * np.pi)
-        return half * (x * x * x) * (self.quadratic / 3 + self.cubic / 4 * x) + wave
+        return half * (x * x * x) * self.quadratic / 3 + wave
 
 
 def ramp_of(o: settings.Ramp, waveform: Waveform) -> Ramp | None:
     """The errors that a scenario states; None where there are none."""
     if o.ideal:
         return None
-    parts = o.quadratic_hz, o.cubic_hz, o.ripple_hz, o.ripple_period_s
-    return Ramp(*parts, waveform.chirp_duration)
+    return Ramp(o.quadratic_hz, o.ripple_hz, RIPPLE_S, waveform.chirp_duration)
 
 
 READ_ERROR = 2e-3

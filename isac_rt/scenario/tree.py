@@ -27,7 +27,7 @@ from pydantic import (
 from isac_rt import registry
 from isac_rt.access.settings import Access
 from isac_rt.frame.settings import Array, Modulation, Noise, RoleChange
-from isac_rt.hardware.settings import Elements, FrontEnd, Response
+from isac_rt.hardware.settings import Elements, FrontEnd
 from isac_rt.propagation.settings import Clutter, Propagation
 from isac_rt.receive.settings import Receivers
 from isac_rt.scenario.presets import Preset, ReceiverSet, with_preset
@@ -470,13 +470,11 @@ class Scenario(Node):
         for key, one in stated.items():
             yield from self._element_problems((*key, "transmit"), one.transmit, self.num_tx)
             yield from self._element_problems((*key, "receive"), one.receive, self.num_rx)
-            sent, heard = one.transmit_response, one.receive_response
-            yield from self._element_problems((*key, "transmit_response"), sent, self.num_tx)
-            yield from self._element_problems((*key, "receive_response"), heard, self.num_rx)
+            sent = one.transmit_response
             if sent.differs and self.radio.bands(self.num_tx) > 1:
                 said = (
                     "antennas that send at once have one response over the chirp here; state it by "
-                    "a table or a polynomial of all and set its slope_std_db and slope_std_deg to "
+                    "a table of all and set its slope_std_db and slope_std_deg to "
                     "0, or take another scheme"
                 )
                 yield Problem(((*key, "transmit_response"), ("radio", "scheme")), said)
@@ -490,11 +488,10 @@ class Scenario(Node):
                 yield Problem(((*key, *powers[0]), ("noise", "model")), said)
 
     @staticmethod
-    def _element_problems(key: Key, elements: Elements | Response, size: int) -> Iterator[Problem]:
+    def _element_problems(key: Key, elements: Elements, size: int) -> Iterator[Problem]:
         for name, count in elements.counts():
             if count != size:
-                end = str(key[-1]).removesuffix("_response")
-                said = f"{count} values for {size} {end} elements; state one of each element"
+                said = f"{count} values for {size} {key[-1]} elements; state one of each element"
                 yield Problem(((*key, name), ("array",)), said)
                 return
 

@@ -63,8 +63,7 @@ def received(
     noise : at the receiver's input
     """
     schedule, tones = heard(waveform, links, receiver, reference)
-    middle = reference.start_time + waveform.frame_duration / 2
-    tones = _with_elements(tones, waveform, links, receiver, ends, middle)
+    tones = _with_elements(tones, waveform, links, receiver, ends)
     delays = np.concatenate([s.delay for _, s in links] or [np.zeros(0)])
     flicker = _Flicker.of(waveform, reference, ends, tones, delays)
     turns = _turns(waveform, tones, ends)
@@ -186,18 +185,17 @@ def _level(samples: np.ndarray, work: Work, num_chirps: int) -> float:
 
 
 def _with_elements(
-    tones: Tones, w: Waveform, links: Links, receiver: ReceiveArray, ends: Ends, middle: float
+    tones: Tones, w: Waveform, links: Links, receiver: ReceiveArray, ends: Ends
 ) -> Tones:
-    """The tones with what the elements of both ends add to delays and amplitudes; `middle` of the
-    frame [s]."""
+    """The tones with what the elements of both ends add to delays and amplitudes."""
     frequency = float(w.carrier(time=w.fast_time[w.num_samples // 2]))
     own = ends.receiver.receive
     if own is not None and tones.size:
         arrival = receiver.pose.to_body(np.concatenate([s.arrival for _, s in links]))
         at = receiver.antennas
         tones = tones._replace(
-            rx_delay=tones.rx_delay + own.delays(arrival),
-            rx_gain=own.factors(arrival, at.rx_positions, at, frequency, middle),
+            rx_delay=tones.rx_delay + own.delay,
+            rx_gain=own.factors(arrival, at.rx_positions, frequency),
         )
     powers = [sent.amplitude**2 for sent, _ in links]
     driven = [saturated(p, one.saturation) for p, one in zip(powers, ends.senders, strict=True)]
@@ -212,8 +210,8 @@ def _with_elements(
             continue
         departure, at = sent.pose.to_body(paths.departure), sent.antennas
         here = np.ix_(tones.link == q, np.arange(at.num_tx))
-        delay[here] += one.transmit.delays(departure)
-        gain[here] = one.transmit.factors(departure, at.tx_positions, at, frequency, middle)
+        delay[here] += one.transmit.delay
+        gain[here] = one.transmit.factors(departure, at.tx_positions, frequency)
     return tones._replace(tx_delay=delay, tx_gain=gain)
 
 

@@ -64,7 +64,7 @@ def test_biases_follow_delays_and_phases_of_the_channels():
     the arms explains to a tenth: the strongest beam is not quite the regression. Planted bugs: the
     slope with the other sign; all channels in place of the arm."""
     late = FrontEnd.model_validate(
-        {"transmit": {"common_delay_ps": 228.0}, "receive": {"common_delay_ps": 228.0}}
+        {"transmit": {"delay_ps": [228.0]}, "receive": {"delay_ps": [228.0]}}
     )
     found = front_ends.biases(late, 1, 7)
     assert len(found) == 4
