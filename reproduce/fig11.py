@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from isac_rt.frame.payload import MODULATION_ORDERS
 from isac_rt.randomness import generator
-from isac_rt.receive.settings import Receivers
+from isac_rt.receive.clutter.filter import RUN_CELLS
 from reproduce.baselines import LoRadar, loradar_symbol_errors
 from reproduce.fig12 import SNR_DB, clutter_verdict, draw_rate
 from reproduce.montecarlo import (
@@ -56,7 +56,7 @@ def links() -> tuple[Setting, ...]:
             waveform=_LONG,
             orders=(8,),
             clutter=True,
-            run_cells=Receivers().clutter_run_cells,
+            run_cells=RUN_CELLS,
         ),
         Setting(
             name="clutter, profile known", waveform=_LONG, orders=(8,), clutter=True, profile=True

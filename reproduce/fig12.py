@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from isac_rt.frame.payload import MODULATION_ORDERS
-from isac_rt.receive.settings import Receivers
+from isac_rt.receive.clutter.filter import RUN_CELLS
 from isac_rt.receive.symbols.powers import EXTRA_CELLS
 from reproduce.montecarlo import INTERVAL, Curve, Precision, Steps, delay_error_rate
 from reproduce.outcome import (
@@ -49,7 +49,7 @@ def links() -> tuple[Setting, ...]:
             name="clutter, filtered",
             waveform=_LONG,
             clutter=True,
-            run_cells=Receivers().clutter_run_cells,
+            run_cells=RUN_CELLS,
         ),
         Setting(name="clutter, profile known", waveform=_LONG, clutter=True, profile=True),
     )

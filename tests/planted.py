@@ -199,10 +199,10 @@ OF_CASES = {
     "thermal noise": Bug(
         "frame/level.py",
         """BOLTZMANN
-        * noise.temperature_k
+        * TEMPERATURE_K
         * waveform.sampling_rate
         *""",
-        "2 * BOLTZMANN * noise.temperature_k * waveform.sampling_rate *",
+        "2 * BOLTZMANN * TEMPERATURE_K * waveform.sampling_rate *",
     ),
     "phase of scatterers in flight": Bug(
         "kernels/propagation_field.py",

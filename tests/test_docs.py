@@ -48,7 +48,7 @@ def test_the_reference_has_every_key(site):
         r"<[^>]+>", "", (site / "generated" / "scenario.html").read_text(encoding="utf-8")
     )
     for key in (
-        "filter_transition_hz",
+        "sampling_rate_hz",
         "weakest_path_db",
         "clock_drift_ppm",
         "cell_area_per_metre_m",

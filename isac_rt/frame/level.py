@@ -10,15 +10,13 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.settings import Noise
 from isac_rt.frame.waveform import BOLTZMANN, Waveform
 
+TEMPERATURE_K = 290.0
+"""Temperature of the thermal noise, from which noise figures count."""
+
 
 def thermal_noise_power(noise: Noise, waveform: Waveform) -> float:
     """k T f_s F [W]: E|n|^2 of a complex IF sample; the filter's noise bandwidth is f_s."""
-    return (
-        BOLTZMANN
-        * noise.temperature_k
-        * waveform.sampling_rate
-        * 10 ** (noise.noise_figure_db / 10)
-    )
+    return BOLTZMANN * TEMPERATURE_K * waveform.sampling_rate * 10 ** (noise.noise_figure_db / 10)
 
 
 def transmit_amplitude(noise: Noise) -> float:

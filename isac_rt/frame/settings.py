@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from fractions import Fraction as Rational
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
@@ -70,17 +70,24 @@ def beam_solid_angle(half_view: float) -> float:
 
 
 STATED_SHARE = 1e-2
-"""A bandwidth or a duration that is stated twice may differ by this share."""
+"""A bandwidth that is stated twice may differ by this share."""
 
 
 _MOST_BLOCKS = 10**9
 """More come of numbers that no chirp has, and are refused as these."""
 SKIRT_SHARE = 0.02
-"""Width of the IF filter's skirts over the sampling rate, where a data sheet states none."""
+"""Width of the IF filter's skirts over the sampling rate; the paper names none."""
 
 
 class Chirp(Node):
-    """Timing of a plain FMCW chirp as a data sheet states it."""
+    """Timing of a plain FMCW chirp as a data sheet states it; samples and their rate stand in
+    `radio.samples_per_chirp` and `radio.sampling_rate_hz`."""
+
+    REMOVED: ClassVar[dict[str, str]] = {
+        "samples": "radio.samples_per_chirp",
+        "sampling_msps": "radio.sampling_rate_hz",
+        "repetition_us": "idle_us: the repetition less the ramp",
+    }
 
     slope_mhz_per_us: Positive
     """Slope of the ramp [MHz/us]. A steeper one sweeps more bandwidth while samples are taken:
@@ -90,28 +97,16 @@ class Chirp(Node):
     adc_start_us: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     """First sample after the start of the ramp [us]; not before the echo of the longest range has
     come back."""
-    samples: Annotated[int, Field(ge=16, le=65536)] | None = None
-    """Samples taken of each chirp. null, the default: `radio.samples_per_chirp`."""
-    sampling_msps: Positive | None = None
-    """Rate of complex samples [Msps]; of a sensor that samples real values half of its rate. null,
-    the default: `radio.sampling_rate_hz`."""
-    idle_us: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
-    """Pause between a ramp's end and the next one's start [us]. null, the default: what
-    `repetition_us` leaves."""
-    repetition_us: Positive | None = None
-    """Time from the start of a ramp to the start of the next [us]. null, the default: `idle_us` and
-    `ramp_end_us` together."""
-
-    def problems(self) -> Iterator[Problem]:
-        if self.idle_us is None and self.repetition_us is None:
-            yield Problem(
-                (("idle_us",), ("repetition_us",)),
-                "missing: a chirp needs idle_us or repetition_us; add one of them",
-            )
+    idle_us: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    """Pause between a ramp's end and the next one's start [us]."""
 
 
 class Radio(Node):
     """The chirp that is sent and the frame that chirps form."""
+
+    REMOVED: ClassVar[dict[str, str]] = {
+        "filter_transition_hz": "leave it out: the filter's skirts are 2 % of the sampling rate"
+    }
 
     carrier_hz: Positive = 77e9
     """Frequency at which the chirp starts [Hz]; it sweeps upwards from there by `bandwidth_hz`.
@@ -136,10 +131,6 @@ class Radio(Node):
     """Chirp groups that are sent at once, each in a resource block of its own; at most the number
     of transmit antennas. Every group carries data of its own. The default keeps all three transmit
     antennas of the default array busy."""
-    filter_transition_hz: Positive = 0.4e6
-    """Width of the IF filter's skirts on each side of its passband, which reaches from zero to the
-    sampling rate [Hz]. Wider skirts let in more of the neighbouring resource blocks. The default is
-    2 % of the default sampling rate, or of a data sheet's; the paper names none."""
     mode: Literal["isac", "fmcw"] = "isac"
     """What the chirps are for. `isac`, the default and the paper's, carries data to passive
     terminals; `fmcw` is a plain radar without data, which sees all range cells."""
@@ -171,15 +162,9 @@ class Radio(Node):
         if not isinstance(chirp, dict):
             return out
         numbers = {k: v for k, v in chirp.items() if type(v) in (int, float) and 0 <= v < 1e9}
-        if "samples" in numbers:
-            out.setdefault("samples_per_chirp", numbers["samples"])
-        if numbers.get("sampling_msps"):
-            out.setdefault("sampling_rate_hz", numbers["sampling_msps"] * 1e6)
         default = cls.model_fields
         size = out.get("samples_per_chirp", default["samples_per_chirp"].default)
         rate = out.get("sampling_rate_hz", default["sampling_rate_hz"].default)
-        if type(rate) in (int, float) and 0 < rate < 1e12:
-            out.setdefault("filter_transition_hz", SKIRT_SHARE * rate)
         if type(size) is int and type(rate) in (int, float) and rate > 0:
             last = numbers.get("adc_start_us", 0.0) + size / rate * 1e6
             ramp = numbers.get("ramp_end_us", last)
@@ -204,9 +189,6 @@ class Radio(Node):
     def repetition_s(self) -> float:
         """From the start of a data sheet's ramp to the start of the next."""
         assert self.chirp is not None
-        if self.chirp.repetition_us is not None:
-            return self.chirp.repetition_us * 1e-6
-        assert self.chirp.idle_us is not None
         return self.chirp.idle_us * 1e-6 + self.ramp_end_s
 
     def times(self, num_tx: int) -> ChirpTimes:
@@ -283,17 +265,10 @@ class Radio(Node):
         if self.chirp is None or self.mode == "isac":
             return
         c, sampled = self.chirp, self.samples_per_chirp / self.sampling_rate_hz
-        twice: tuple[tuple[str, float | None, float], ...] = (
-            ("samples_per_chirp", c.samples, self.samples_per_chirp),
-            ("sampling_rate_hz", c.sampling_msps and c.sampling_msps * 1e6, self.sampling_rate_hz),
-            ("bandwidth_hz", c.slope_mhz_per_us * 1e12 * self.ramp_end_s, self.bandwidth_hz),
-        )
-        for key, follows, stated in twice:
-            if follows is None:
-                continue
-            if not abs(stated - follows) <= STATED_SHARE * follows < math.inf:
-                said = f"but {follows:g} follows from radio.chirp; leave one of the two out"
-                yield Problem(((key,), ("chirp",)), said)
+        follows = c.slope_mhz_per_us * 1e12 * self.ramp_end_s
+        if not abs(self.bandwidth_hz - follows) <= STATED_SHARE * follows < math.inf:
+            said = f"but {follows:g} follows from radio.chirp; leave one of the two out"
+            yield Problem((("bandwidth_hz",), ("chirp",)), said)
         last = c.adc_start_us * 1e-6 + sampled
         if last > self.ramp_end_s * (1 + 1e-9):
             yield Problem(
@@ -301,18 +276,6 @@ class Radio(Node):
                 f"the last sample is taken {last * 1e6:g} us after the start of the ramp, which "
                 "has ended by then; lengthen the ramp, or take fewer samples, earlier or faster",
             )
-        if (slot := self.repetition_s) < self.ramp_end_s * (1 - 1e-9):
-            yield Problem(
-                (("chirp", "repetition_us"), ("chirp", "ramp_end_us")),
-                f"{slot * 1e6:g} us are shorter than the ramp of {self.ramp_end_s * 1e6:g} us",
-            )
-        if c.idle_us is not None and c.repetition_us is not None:
-            whole = c.idle_us + self.ramp_end_s * 1e6
-            if abs(whole - c.repetition_us) > STATED_SHARE * c.repetition_us:
-                yield Problem(
-                    (("chirp", "repetition_us"), ("chirp", "idle_us"), ("chirp", "ramp_end_us")),
-                    f"but idle time and ramp last {whole:g} us together; leave one of them out",
-                )
         longest = self.sampling_rate_hz / (c.slope_mhz_per_us * 1e12)
         if c.adc_start_us * 1e-6 < longest * (1 - 1e-9):
             yield Problem(
@@ -526,6 +489,10 @@ class Modulation(Node):
 class Noise(Node):
     """How strong the receiver's noise is: by a link budget in watts, or by a stated SNR."""
 
+    REMOVED: ClassVar[dict[str, str]] = {
+        "temperature_k": "noise_figure_db, which counts from 290 K: 10 log10(F - 1 + T/290)"
+    }
+
     model: Literal["link_budget", "snr"] = "link_budget"
     """How the noise is set: `link_budget`, the default, takes transmit power and thermal noise, so
     that paths stand in their true proportion; `snr` takes `snr_db`, as the paper does."""
@@ -535,9 +502,6 @@ class Noise(Node):
     noise_figure_db: Decibels = 12.0
     """Noise figure of the receiver [dB], for `link_budget`: how far its noise is above the thermal
     noise. The default is that of a 77 GHz radar chip."""
-    temperature_k: Positive = 290.0
-    """Temperature of the thermal noise [K], for `link_budget`. The default is the standard's
-    reference temperature."""
     snr_db: Decibels = 10.0
     """SNR of one IF sample at one antenna before any processing [dB], for `snr`. It is that of the
     reference path (the strongest target at an active terminal, the line of sight at a passive one),

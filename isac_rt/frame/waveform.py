@@ -11,7 +11,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from isac_rt.frame.settings import Array, ChirpTimes, Radio, chirp_times, num_resource_blocks
+from isac_rt.frame.settings import (
+    SKIRT_SHARE,
+    Array,
+    ChirpTimes,
+    Radio,
+    chirp_times,
+    num_resource_blocks,
+)
 
 SPEED_OF_LIGHT = 299_792_458.0
 BOLTZMANN = 1.380649e-23
@@ -329,7 +336,7 @@ def waveform_of(r: Radio, a: Array) -> Waveform:
         num_chirps=r.chirps_per_frame,
         num_groups=r.groups,
         num_tx=num_tx,
-        filter_transition=r.filter_transition_hz,
+        filter_transition=SKIRT_SHARE * r.sampling_rate_hz,
         sweep=sweep,
         carries_data=r.mode == "isac",
         scheme=scheme if r.bands(num_tx) > 1 and scheme != "simo" else "tdm",

@@ -77,7 +77,8 @@ fewer rays get less room."""
 MOST_RAYS_KEPT = 20_000
 """Rays of a diffuse solution that is kept for later runs, at most: with more, a run of a hundred
 frames would fill the store."""
-
+LEAKAGE_S = 1e-9
+"""Delay of what a receiver hears of its own transmitter: 30 cm of way."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -126,7 +127,7 @@ class RayTracer:
                 self.two_bounces = TwoBounces.plan(
                     self.field, city, wavelength, free.seed, clutter.mirrors
                 )
-        depth = propagation.max_bounces if propagation.specular and city.num_faces else 0
+        depth = propagation.max_bounces if city.num_faces else 0
         flights = {
             name: Flight(swarm.trajectories[name], swarm.duration, city.origin, knot_spacing)
             for name in (self._terminals if knot_spacing and depth else [])
@@ -255,7 +256,7 @@ class RayTracer:
     def _solved_legs(self, local: dict[str, Pose], num_rays: int) -> TracedLegs:
         """Legs from every terminal to every UAV, by mirror reflections only, of Sionna's solver."""
         p = self._propagation
-        depth = p.max_bounces if p.specular and self._city.num_faces else 0
+        depth = p.max_bounces if self._city.num_faces else 0
         sources = {name: local[name].position for name in self._terminals}
         sinks = {name: local[name].position for name in self._free.names}
         beside = (
@@ -373,7 +374,7 @@ class RayTracer:
         leakage, ahead = self._propagation.leakage, state.start.rotation[:, 1][None]
         return make_paths(
             gain=[10 ** (-leakage.isolation_db / 20)],
-            delay=[leakage.delay_s],
+            delay=[LEAKAGE_S],
             departure=ahead,
             arrival=ahead,
             kind=PathKind.LEAKAGE,

@@ -15,18 +15,20 @@ from isac_rt.settings import Decibels, Loss, Node, Positive, Problem
 class Leakage(Node):
     """What a terminal's receiver hears of its own transmitter on the same body."""
 
+    REMOVED: ClassVar[dict[str, str]] = {"delay_s": "leave it out: it is 1e-9, 30 cm of way"}
+
     enabled: bool = True
     """Whether leakage is simulated, with `propagation.model: ray_traced`. On by default, for no
     radar is without it."""
     isolation_db: Loss = 60.0
     """Loss from the transmit to the receive antennas of one body [dB]. The default is that of
     separate antennas on one board."""
-    delay_s: Annotated[float, Field(ge=0)] = 1e-9
-    """Delay of the leakage [s]. The default is 30 cm of way."""
 
 
 class Propagation(Node):
     """Which paths there are between the terminals and by way of the targets."""
+
+    REMOVED: ClassVar[dict[str, str]] = {"specular": "max_bounces: 0 for no mirror reflections"}
 
     model: Annotated[str, PROPAGATION_MODELS] = "free_space"
     """How paths are found: `free_space`, the default and the paper's, has lines of sight and echoes
@@ -44,8 +46,6 @@ class Propagation(Node):
     ghosts: bool = True
     """Whether echoes of a target that also bounce off the city are simulated; a receiver takes them
     for targets. On by default, as in any street."""
-    specular: bool = True
-    """Whether mirror reflections off the city are simulated. On by default, as in any street."""
     weakest_path_db: Loss = 40.0
     """How far below the noise of one range-Doppler-antenna cell paths must be to be left out [dB].
     The default leaves out a ten-thousandth of the noise; a smaller value is faster."""

@@ -262,7 +262,7 @@ def strongest_peaks(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(row, bin) of the peaks that are no sidelobes of a stronger one (`without_sidelobes`), at
     most `max_detections`."""
-    rows, bins = peaks(power, above, settings.cluster_cells)
+    rows, bins = peaks(power, above, (1, 1))
     keep = np.flatnonzero(without_sidelobes(rows, bins, power, power.shape[1], floor))[
         : settings.max_detections
     ]

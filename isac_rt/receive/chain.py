@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from isac_rt.receive.clutter.filter import ClutterFilter
+from isac_rt.receive.clutter.filter import RUN_CELLS, ClutterFilter
 from isac_rt.receive.estimate import Estimator
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.joint.neighbours import refine_jointly
@@ -29,7 +29,7 @@ Refiner = Callable[[Moments, Detections], tuple[Detections, np.ndarray]]
 FILTERS: dict[str, Callable[[Receivers], ClutterFilter | None]] = {
     "none": lambda settings: None,
     "zero_doppler": lambda settings: ClutterFilter(None),
-    "runs": lambda settings: ClutterFilter(settings.clutter_run_cells),
+    "runs": lambda settings: ClutterFilter(RUN_CELLS),
 }
 CFARS: dict[str, Callable[[Receivers, Estimator], Cfar]] = {
     "auto": BySchedule,

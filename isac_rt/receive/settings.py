@@ -14,8 +14,6 @@ COUNTS_WITH = {
     "velocity_method": ("clutter_detector", ("cfar",)),
     "update_false_alarm_rate": ("clutter_detector", ("angle_doppler",)),
     "gate_false_alarm_rate": ("clutter_detector", ("angle_doppler",)),
-    "clutter_run_cells": ("clutter_filter", ("runs",)),
-    "cluster_cells": ("velocity_method", ("auto", "omp", "latin_union", "conventional")),
 }
 """Keys of `receivers` that play a part only with some values of another key."""
 
@@ -25,6 +23,8 @@ class Receivers(Node):
 
     REMOVED: ClassVar[dict[str, str]] = {
         "active_input": "leave it out: every receiver starts from samples",
+        "cluster_cells": "leave it out: a detection is the strongest of its neighbours",
+        "clutter_run_cells": "leave it out: a run counts as clutter from 15 cells on",
         "clutter_channels": "leave it out; clutter_detector: angle_doppler filters all antennas",
         "clutter_detector: map": "clutter_detector: angle_doppler, which uses the same mesh",
         "clutter_detector: sample_matrix": "clutter_detector: angle_doppler in a city, else cfar",
@@ -79,9 +79,6 @@ class Receivers(Node):
     """Cells in range and in Doppler on each side, beyond the guard cells, from which the background
     of a cell is measured. More cells measure it better and follow its changes worse; the default
     takes over a hundred before and behind."""
-    cluster_cells: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (1, 1)
-    """Reach in range and in Doppler within which only the strongest cell counts as a detection. The
-    default tells neighbours apart that are two cells away."""
     max_detections: Annotated[int, Field(ge=1, le=10_000)] = 64
     """Most detections that a terminal keeps of a frame, the strongest ones. The default is far more
     than a swarm has targets."""
@@ -90,12 +87,9 @@ class Receivers(Node):
     passive one. The default leaves out the transmitter's leakage."""
     clutter_filter: Literal["none", "zero_doppler", "runs"] = "none"
     """What is taken out before detection. `none`: nothing, the default. `zero_doppler`: what stands
-    still relative to an active terminal, in all range cells. `runs`, the paper's: the same in long
-    runs of occupied range cells only, which a passive terminal leaves out of its symbol
+    still relative to an active terminal, in all range cells. `runs`, the paper's: the same in
+    runs of 15 occupied range cells and more only, which a passive terminal leaves out of its symbol
     decision."""
-    clutter_run_cells: Annotated[int, Field(ge=2)] = 15
-    """Consecutive occupied range cells from which on a run counts as clutter, for `clutter_filter:
-    runs`. The default lies below the 40 cells that the paper's clutter has at least."""
     clutter_detector: Annotated[str, DETECTORS] = "cfar"
     """What an active terminal compares a cell with. `cfar`, the default: the cells around it.
     `angle_doppler`: all antennas are added in phase towards every direction, and filtered with the

@@ -381,7 +381,7 @@ def mechanisms(p: Propagation, c: Clutter) -> dict[str, Any]:
     traced = p.model == "ray_traced"
     return {
         "propagation": p.model,
-        "max_bounces": p.max_bounces if traced and p.specular else 0,
+        "max_bounces": p.max_bounces if traced else 0,
         "ghosts": traced and p.ghosts,
         "leakage": traced and p.leakage.enabled,
         "clutter": c.model,

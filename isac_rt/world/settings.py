@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
@@ -54,6 +54,10 @@ class MaterialOverride(Node):
 class City(Node):
     """Where the mesh of the city comes from. `source` decides which of the other keys apply."""
 
+    REMOVED: ClassVar[dict[str, str]] = {
+        "level_height_m": "leave it out: a storey is 3 m, as in OpenStreetMap's Simple 3D Buildings"
+    }
+
     source: Annotated[str, CITY_SOURCES]
     """Kind of city: `builtin` is a scene that comes with Sionna RT, `mitsuba`, `mesh` and
     `footprints` read a file, `canyon` is one street between two rows of buildings, `blocks` a grid
@@ -101,9 +105,6 @@ class City(Node):
     """Property that holds a building's height [m] in a `footprints` file; text such as 12,5 or
     40 ft is understood. Where it is missing, `building:levels` counts. The default is what most
     exports of OpenStreetMap call it."""
-    level_height_m: Positive = 3.0
-    """Height of a storey [m], where a `footprints` file tells storeys. The default is that of
-    OpenStreetMap's Simple 3D Buildings."""
     default_height_m: Positive = 10.0
     """Height of a building whose footprint has none [m]. The default is three storeys."""
     wall_material: str = "concrete"
@@ -195,7 +196,6 @@ CITY_KEYS: dict[str, frozenset[str]] = {
             "origin",
             "terrain",
             "height_property",
-            "level_height_m",
             "default_height_m",
             "material_map",
         }

@@ -333,9 +333,7 @@ def test_receiver_finds_what_clutter_hides():
     received = cube(w, schedule, payload, [*truth, target], antennas, 20.0, 1)
     count = {}
     for detector, more in (("cfar", {}), ("angle_doppler", {})):
-        settings = Receivers(
-            clutter_detector=detector, false_alarm_rate=1e-5, cluster_cells=(2, 2), **more
-        )
+        settings = Receivers(clutter_detector=detector, false_alarm_rate=1e-5, **more)
         d = receive_active(received, payload, antennas, settings, clutter=guess).detections
         near = (np.abs(d.range - 17.3) < w.range_cell(2)) & (
             np.abs(d.velocity - target.rate / 2) < w.velocity_cell(2)

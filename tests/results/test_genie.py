@@ -74,7 +74,7 @@ def test_the_matched_filter_of_losses_is_one():
     the noise figure left out; the genie's threshold that of two looks."""
     scenario = load(SCENE, ["receiver_preset=plain", "clutter={model: none}"])
     setup, noise, compared = prepare(scenario), scenario.noise, 0
-    watts = BOLTZMANN * noise.temperature_k * 10 ** (noise.noise_figure_db / 10)
+    watts = BOLTZMANN * 290.0 * 10 ** (noise.noise_figure_db / 10)
     watts *= setup.waveform.sampling_rate
     threshold = -2 * np.log(scenario.receivers.false_alarm_rate)
     frame, when = setup.frame(FRAME), setup.timetable.epoch(FRAME, "AT")

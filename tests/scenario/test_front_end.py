@@ -174,7 +174,6 @@ def test_what_is_stated_is_written_and_read_again(tmp_path):
                         "slope_mhz_per_us": 1e308,
                         "adc_start_us": 0,
                         "idle_us": 1,
-                        "sampling_msps": 10,
                     },
                 },
             },

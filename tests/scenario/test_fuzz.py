@@ -464,8 +464,6 @@ def test_what_cannot_run_is_refused_before_it_starts(changes, words, tmp_path, c
         {"swarm": {"A": {"role": "active", "position_m": [0, 0, 9], "velocity_mps": [0, 9300, 0]}}},
         {"noise": {"tx_power_dbm": 120.0}},
         {"noise": {"noise_figure_db": 120.0}},
-        {"noise": {"temperature_k": 290_000.0}},
-        {"radio": {"filter_transition_hz": 400e6}},
         {"frame_interval_s": 45.0},
     ],
     ids=lambda c: next(iter(c)),

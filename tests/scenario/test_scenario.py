@@ -168,13 +168,8 @@ def test_scenes_load_without_doubts_and_round_trip(path, tmp_path):
             "receivers.refinement = grid: has no meaning with velocity_method pursuit",
         ),
         (
-            BASE + "receivers: {velocity_method: pursuit, cluster_cells: [2, 2]}\n",
-            "receivers.cluster_cells = [2, 2]: has no meaning with velocity_method pursuit, only "
-            "with auto or omp or latin_union or conventional",
-        ),
-        (
-            BASE + "receivers: {clutter_filter: zero_doppler, clutter_run_cells: 20}\n",
-            "receivers.clutter_run_cells = 20: has no meaning with clutter_filter zero_doppler",
+            BASE + "receivers: {clutter_detector: cfar, update_false_alarm_rate: 0.001}\n",
+            "receivers.update_false_alarm_rate = 0.001: has no meaning with clutter_detector cfar",
         ),
         (
             BASE + "tracking: {confirm_hits: 6}\n",
@@ -503,7 +498,7 @@ def test_schema_describes_every_mapping():
     assert json.loads(json.dumps(schema)) == schema
     assert schema["additionalProperties"] is False
     assert {"Radio", "Uav", "City"} <= set(schema["$defs"])
-    assert "skirts" in schema["$defs"]["Radio"]["properties"]["filter_transition_hz"]["description"]
+    assert "mixer" in schema["$defs"]["Radio"]["properties"]["sampling_rate_hz"]["description"]
 
 
 numbers = st.floats(-5e3, 5e3).map(lambda x: x + 0.0)
@@ -554,7 +549,6 @@ def scenarios(draw) -> dict:
     }
     tree["radio"] = {
         "carrier_hz": draw(st.floats(1e10, 1e12)),
-        "filter_transition_hz": draw(st.floats(1e-300, 1e300)),
     }
     tree["noise"] = {"snr_db": draw(st.floats(-400, 400))}
     material = {"scattering_coefficient": draw(st.floats(0, 1))}

@@ -23,6 +23,9 @@ from scipy import special
 from isac_rt.frame.schedule import Schedule
 from isac_rt.receive.transform import transform
 
+RUN_CELLS = 15
+"""Consecutive occupied range cells from which on a run counts as clutter: below the 40 cells that
+the paper's clutter has at least."""
 GAP = 3
 MARGIN = 2
 """Cells that the window's main lobe reaches beyond a run."""

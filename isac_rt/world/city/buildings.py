@@ -22,6 +22,8 @@ OTHER_KEYS = tuple(
     "place boundary tourism".split()
 )
 """Keys of OpenStreetMap that say what a polygon without a building tag is."""
+STOREY_M = 3.0
+"""Height of a storey: that of OpenStreetMap's Simple 3D Buildings."""
 PLATE_M = 0.3
 """Thickness of a roof without walls."""
 MOST_COVERED = 0.5
@@ -134,7 +136,7 @@ class _Heights:
     def levels(self, tags: Tags, what: str, *keys: str) -> float | None:
         """Height of so many storeys. [m]"""
         found = self.metres(tags, what, *keys)
-        return None if found is None else found * self.city.level_height_m
+        return None if found is None else found * STOREY_M
 
     def outline(self, feature: Feature, tags: Tags) -> Outline:
         """A building as its tags describe it."""
