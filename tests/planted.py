@@ -198,11 +198,8 @@ OF_CASES = {
     ),
     "thermal noise": Bug(
         "frame/level.py",
-        """BOLTZMANN
-        * TEMPERATURE_K
-        * waveform.sampling_rate
-        *""",
-        "2 * BOLTZMANN * TEMPERATURE_K * waveform.sampling_rate *",
+        "return BOLTZMANN * TEMPERATURE_K",
+        "return 2 * BOLTZMANN * TEMPERATURE_K",
     ),
     "phase of scatterers in flight": Bug(
         "kernels/propagation_field.py",
