@@ -143,14 +143,12 @@ class Oscillator:
 
     Attributes
     ----------
-    mask : of its noise; None: none
-    spurs : ((offset [Hz], level of each sideband [dBc]), ...)
+    mask : of its noise
     rate : sampling rate of the IF [Hz]
     seed, name : of the run and of the terminal, from which its noise is drawn
     """
 
-    mask: Mask | None
-    spurs: tuple[tuple[float, float], ...]
+    mask: Mask
     rate: float
     seed: int
     name: str
@@ -171,17 +169,9 @@ class Oscillator:
         step = fastest.step
         first = int(np.floor(begin / step)) - _SPAN
         count = int(np.ceil(end / step)) + _SPAN - first + 1
-        if self.mask is None:
-            values = np.zeros(count)
-        else:
-            values = self._slower(slower, first, count, step)
-            self._add_band(values, 0, fastest, first)
-        start = first * step
-        for i, (offset, level) in enumerate(self.spurs):
-            phase = generator(self.seed, "spur", self.name, i).uniform(0, 2 * np.pi)
-            turn = 2 * np.pi * ((offset * start) % 1.0) + phase
-            values += 2 * 10 ** (level / 20) * _sine(2 * np.pi * offset * step, turn, count)
-        return Record(start, step, values)
+        values = self._slower(slower, first, count, step)
+        self._add_band(values, 0, fastest, first)
+        return Record(first * step, step, values)
 
     def _slower(self, bands: list[_Band], first: int, count: int, step: float) -> np.ndarray:
         """Sum of the slower bands at places first .. first + count - 1 of the fastest one."""
@@ -212,15 +202,6 @@ class Oscillator:
             out[low - first : high - first] += weight[inside] * block[inside]
 
 
-def _sine(angle: float, first: float, count: int) -> np.ndarray:
-    """sin(`first` + n `angle`) for n = 0 .. count - 1: of sums of two angles, each of a few."""
-    few = int(np.ceil(np.sqrt(count)))
-    coarse, fine = first + few * angle * np.arange(few), angle * np.arange(few)
-    out = np.outer(np.sin(coarse), np.cos(fine))
-    out += np.outer(np.cos(coarse), np.sin(fine))
-    return out.ravel()[:count]
-
-
 @lru_cache(maxsize=4)
 def _fades(size: int, hop: int) -> np.ndarray:
     """Weights of a block (size,) float32: sin to 1, and cos from the next block's beginning on."""
@@ -248,13 +229,12 @@ def _block(oscillator: Oscillator, number: int, index: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def _amplitudes(mask: Mask | None, band: _Band) -> np.ndarray:
+def _amplitudes(mask: Mask, band: _Band) -> np.ndarray:
     """Size of each line of a block, for `scipy.fft.irfft`, float32.
 
     What the cubic between the values takes away of the highest frequencies, in the mean over all
     places, is given back.
     """
-    assert mask is not None
     width = 1 / (band.size * band.step)
     lines = np.arange(int(np.ceil(band.low / width)), int(np.ceil(band.high / width)))
     offset = lines * width
@@ -269,8 +249,7 @@ def oscillator_of(o: settings.Oscillator, rate: float, seed: int, name: str) -> 
     """The oscillator that a scenario states of a terminal; None where it is ideal."""
     if o.ideal:
         return None
-    mask = Mask(o.mask_dbc_hz, o.locked) if o.mask_dbc_hz else None
-    return Oscillator(mask, o.spurs_dbc, rate, seed, name)
+    return Oscillator(Mask(o.mask_dbc_hz, o.locked), rate, seed, name)
 
 
 def spread(mask: Mask | None, apart: float, duration: float, rate: float) -> np.ndarray:

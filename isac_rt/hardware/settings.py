@@ -16,6 +16,10 @@ Offset = Annotated[float, Field(ge=1e-3, le=1e12, allow_inf_nan=False)]
 class Oscillator(Node):
     """Phase noise of a terminal's oscillator, as a mask of its single-sideband spectrum."""
 
+    REMOVED: ClassVar[dict[str, str]] = {
+        "spurs_dbc": "mask_dbc_hz, with a narrow plateau of the line's power, or leave it out"
+    }
+
     mask_dbc_hz: tuple[tuple[Offset, Decibels], ...] = ()
     """Points [offset from the carrier in Hz, single-sideband noise in dBc/Hz] in the order of their
     offsets; the level may not rise. It is interpolated on logarithmic axes and held beyond the last
@@ -24,14 +28,11 @@ class Oscillator(Node):
     """Whether the oscillator is locked to one without noise: below the first point the level is
     held. If not, it goes on rising towards the carrier with the slope of the first two points.
     Locked by default."""
-    spurs_dbc: tuple[tuple[Offset, Decibels], ...] = ()
-    """Discrete lines, such as those of a synthesiser's reference: [offset in Hz, level of each of
-    the two sidebands in dBc]. None by default."""
 
     @property
     def ideal(self) -> bool:
-        """Whether it has neither noise nor lines."""
-        return not self.mask_dbc_hz and not self.spurs_dbc
+        """Whether it has no noise."""
+        return not self.mask_dbc_hz
 
     def problems(self) -> Iterator[Problem]:
         for i, (before, after) in enumerate(itertools.pairwise(self.mask_dbc_hz), start=1):
@@ -50,10 +51,6 @@ class Oscillator(Node):
         if self.mask_dbc_hz and not self.locked and len(self.mask_dbc_hz) < 2:
             said = "a free oscillator needs two points or more, whose slope goes on to the carrier"
             yield Problem((("mask_dbc_hz",), ("locked",)), said)
-        for i, (_, level) in enumerate(self.spurs_dbc):
-            if level > -10:
-                said = f"{level:g} dBc is no spur but a second carrier; at most -10 dBc"
-                yield Problem((("spurs_dbc", i),), said)
 
 
 Degrees = Annotated[float, Field(ge=-3600, le=3600, allow_inf_nan=False)]
@@ -305,7 +302,7 @@ class FrontEnd(Node):
     oscillator alone. `awr1443`, `awr2243_cascade`: boards as measured, after calibration of their
     phases, with an oscillator as of data sheets. The default says nothing."""
     oscillator: Oscillator = Oscillator()
-    """Phase noise and spurs. At an active terminal one oscillator serves both ways, so that near
+    """Phase noise. At an active terminal one oscillator serves both ways, so that near
     echoes hardly show its noise; at a passive one its own and the transmitter's add up. None by
     default."""
 

@@ -382,24 +382,18 @@ def noise_left_out(w: Waveform, links: Links, ends: Ends, noise_power: float) ->
 
 
 def within(oscillator: Oscillator | None, duration: float, apart: np.ndarray) -> np.ndarray:
-    """Variance of the phase within a chirp for delays that differ by `apart` (K,) [rad^2]; spurs
-    count with their whole power."""
+    """Variance of the phase within a chirp for delays that differ by `apart` (K,) [rad^2]."""
     if oscillator is None:
         return np.zeros(apart.shape)
     grid, table, of_two = _within(oscillator.mask, duration, oscillator.rate)
     far = np.isinf(apart)
     out = np.interp(np.where(far, 0.0, apart), grid, table)
     out[far] = of_two
-    for offset, level in oscillator.spurs:
-        swing = np.where(far, 2.0, 4 * np.sin(np.pi * offset * np.where(far, 0.0, apart)) ** 2)
-        out += 2 * 10 ** (level / 10) * swing
     return out
 
 
 @lru_cache(maxsize=16)
-def _within(
-    mask: Mask | None, duration: float, rate: float
-) -> tuple[np.ndarray, np.ndarray, float]:
+def _within(mask: Mask, duration: float, rate: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Delays [s] and the variances within a chirp at them, and that of two oscillators."""
     grid = np.concatenate([[0.0], np.geomspace(1e-2, 1e2, 60) / rate])
     table = np.array([spread(mask, apart, duration, rate)[1] for apart in grid])

@@ -15,6 +15,7 @@ class Accuracy(Node):
 
     REMOVED: ClassVar[dict[str, str]] = {
         "preset: fastest": "budget; with propagation.weakest_path_db: 0 it leaves out most",
+        "covered_error_db": "leave it out: it is 20; preset: everything covers none",
         "synthesis_error": "leave it out: samples are within 1e-4; preset: everything is exact",
         "cost_model": "leave it out: the number of paths decides how samples are made",
     }
@@ -34,11 +35,6 @@ class Accuracy(Node):
     and may miss paths over walls that are seen for a shorter way only. Where the chains run, and
     which of them are free, is found out in every frame. The default is shorter than walls are
     wide."""
-    covered_error_db: Annotated[float, Field(ge=0, le=400)] | None = 20.0
-    """How far under the noise of a range-Doppler cell of all channels the error stays that
-    noise covers in the synthesis [dB], for `budget`: most scatterers of a `field` take half of
-    the time then, at an error over the 1e-4 of all others. The default is a hundredth of the
-    noise's power. null: none is covered."""
 
     def applies(self, name: str) -> bool:
         return name == "preset" or self.preset == "budget"

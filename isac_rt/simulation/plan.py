@@ -59,6 +59,9 @@ MOST_DIRECT = 2000
 """Paths up to which the preset everything takes the direct synthesis, whose time grows with them;
 beyond, `Auto`."""
 
+COVERED_DB = 20.0
+"""How far under the noise of a cell of all channels the error stays of paths that noise covers: a
+hundredth of the noise's power."""
 MOST_SPREAD = 12
 """Instants of a run at which its clutter is held against its noise."""
 REACH_MARGIN_M = 1.0
@@ -120,8 +123,7 @@ class Plan:
     def covered(self) -> float:
         """Error of the synthesis that noise covers, over the noise of a cell of all channels; 0:
         none."""
-        db = self.accuracy.covered_error_db
-        return 0.0 if db is None or self.preset != "budget" else float(10 ** (-db / 10))
+        return 0.0 if self.preset != "budget" else float(10 ** (-COVERED_DB / 10))
 
     def spread_frames(self) -> list[int]:
         """Frames that show how the run changes: as few as are a metre of flight apart, evenly, and
@@ -372,7 +374,7 @@ def decisions(plan: Plan) -> dict[str, Any]:
         "reach_m": None if everything else round(plan.reach, 3),
         "synthesis": plan.synthesis(0).name,
         "synthesis_error": GRIDDED_ERROR,
-        "covered_error_db": plan.accuracy.covered_error_db if plan.covered else None,
+        "covered_error_db": COVERED_DB if plan.covered else None,
     }
 
 

@@ -30,6 +30,10 @@ class MaterialOverride(Node):
     """Properties of one material that replace those of the table; what is left out keeps its table
     value."""
 
+    REMOVED: ClassVar[dict[str, str]] = {
+        "pattern_exponent": "leave it out: it is 4, which fitted measured buildings"
+    }
+
     relative_permittivity: Annotated[float, Field(ge=1)] | None = None
     """Real part of the relative permittivity at the carrier, without unit. By default the value of
     ITU-R P.2040 or the rule that the report of a run states."""
@@ -42,10 +46,8 @@ class MaterialOverride(Node):
     there is no agreed measurement at 77 GHz."""
     scattering_pattern: Literal["lambertian", "directive", "backscattering"] | None = None
     """Directions that diffuse power leaves in: `lambertian` about the normal, `directive` about the
-    mirror direction, `backscattering` also back to the source. The table has `lambertian`."""
-    pattern_exponent: Annotated[int, Field(ge=1, le=20)] | None = None
-    """Narrowness of the lobes of `directive` and `backscattering`: a higher exponent makes them
-    narrower. The default, 4, fitted measured buildings (Degli-Esposti 2007)."""
+    mirror direction, `backscattering` also back to the source, with the exponent 4 that fitted
+    measured buildings (Degli-Esposti 2007). The table has `lambertian`."""
     thickness_m: Positive | None = None
     """Thickness of the slab that a face stands for [m]; the two faces of a thin one interfere. By
     default the table's, 0.1 m for most materials."""

@@ -24,7 +24,6 @@ SWARM = {
         ({"mask_dbc_hz": [[1e5, -80]], "locked": False}, "needs two points or more"),
         ({"mask_dbc_hz": [[1e5, float("nan")]]}, "finite number"),
         ({"mask_dbc_hz": [[0.0, -80]]}, "greater than or equal to 0.001"),
-        ({"spurs_dbc": [[1e5, -3]]}, "no spur but a second carrier"),
     ],
 )
 def test_masks_that_are_none_are_refused(oscillator, said):

@@ -433,14 +433,14 @@ def test_overrides_new_materials_and_unknown_names():
             "conductivity_s_per_m": 0.21,
             "scattering_coefficient": 0.37,
         },
-        "glass": {"scattering_pattern": "directive", "pattern_exponent": 6, "thickness_m": 0.021},
+        "glass": {"scattering_pattern": "directive", "thickness_m": 0.021},
     }
     city = load_city(node(**keys, materials=given), ".", F_C, ORIGIN)
     by_name = {m.name: m for m in city.materials}
     assert (by_name["stucco"].relative_permittivity, by_name["stucco"].conductivity) == (3.3, 0.21)
     assert by_name["stucco"].scattering_coefficient == 0.37
     assert by_name["glass"].scattering_pattern == "directive"
-    assert (by_name["glass"].pattern_exponent, by_name["glass"].thickness) == (6, 0.021)
+    assert (by_name["glass"].pattern_exponent, by_name["glass"].thickness) == (4, 0.021)
     assert by_name["glass"].relative_permittivity == 6.31
     assert "scenario: scattering_pattern" in by_name["glass"].source
     with pytest.raises(CityError, match="known are asphalt"):

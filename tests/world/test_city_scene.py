@@ -143,12 +143,10 @@ def test_scattering_patterns_reach_sionna():
     changes = {
         "concrete": {
             "scattering_pattern": "directive",
-            "pattern_exponent": 7,
             "scattering_coefficient": 0.23,
         },
         "asphalt": {
             "scattering_pattern": "backscattering",
-            "pattern_exponent": 3,
             "thickness_m": 0.41,
         },
     }

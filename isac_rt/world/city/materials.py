@@ -356,7 +356,6 @@ def _override(material: Material, change: MaterialOverride) -> Material:
         "conductivity": change.conductivity_s_per_m,
         "scattering_coefficient": change.scattering_coefficient,
         "scattering_pattern": change.scattering_pattern,
-        "pattern_exponent": change.pattern_exponent,
         "thickness": change.thickness_m,
     }
     given = {key: value for key, value in fields.items() if value is not None}
