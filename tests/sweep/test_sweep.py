@@ -106,6 +106,15 @@ def test_points_hold_the_axes_and_the_spawned_seeds(folder):
     assert [p.tree["seed"] for p in points] == [plan.seed(0), plan.seed(1)] * 6
 
 
+@pytest.mark.parametrize(
+    "name", ["canyon_power", "clutter", "front_ends", "own_sensor", "receivers"]
+)
+def test_every_entry_of_the_examples_fits_its_scene(name):
+    """`load_sweep` tries each on the base scenario; a point is what it says."""
+    plan = load_sweep(ROOT / "scenes" / "sweeps" / f"{name}.yaml")
+    assert sum(1 for _ in plan.points()) >= 5
+
+
 def test_zip_and_list_axes(folder):
     text = """
 scenario: base.yaml
