@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from isac_rt.kernels import propagation_bodies
+from isac_rt.kernels.jit import twin_of
 from isac_rt.propagation.legs.diffraction import LIT_REACH, disc, fresnel_unit, tapered
 from isac_rt.world.settings import Uav
 from isac_rt.world.swarm import Pose
@@ -84,7 +86,9 @@ class Bodies:
     ) -> np.ndarray:
         """Multiply `out` by the factors of straight parts that begin `before` along paths of length
         `total`; the paths that a body is near, once for each."""
-        path, body, off, along = self._near(starts, ends, before, total, wavelength, spared)
+        path, body, off, along = near(
+            starts, ends, before, total, self.places, self.radii, spared, wavelength, LIT_REACH
+        )
         radius = self.radii[body]
         far = np.maximum(total[path] - along, radius)  # nearer than its own size a disc is none
         unit = fresnel_unit(wavelength, np.maximum(along, radius), far)
@@ -92,27 +96,29 @@ class Bodies:
         np.multiply.at(out, path, tapered(disc(nu, size), nu - size))
         return path
 
-    def _near(
-        self,
-        starts: np.ndarray,
-        ends: np.ndarray,
-        before: np.ndarray,
-        total: np.ndarray,
-        wavelength: float,
-        spared: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Find the paths (K,), path by path, whose straight part passes a body (N,) within
-        `LIT_REACH` Fresnel units of its edge, unless `spared`; the body, the distance of its
-        centre, and that along the path."""
-        places, radii = self.places, self.radii
-        span, to = ends - starts, places - starts[:, None]
-        square = (span**2).sum(axis=1)[:, None]
-        dot = (to @ span[:, :, None])[:, :, 0]
-        across = np.sqrt(np.maximum((to**2).sum(axis=2) - dot**2 / square, 0.0))
-        at = before[:, None] + dot / np.sqrt(square)
-        near = np.maximum(at, radii)
-        far = np.maximum(total[:, None] - at, radii)
-        edge = LIT_REACH * np.sqrt(wavelength * near * far / (2 * (near + far)))
-        hit = (dot > 0) & (dot < square) & ~spared & (across - radii < edge)
-        which, body = np.nonzero(hit)
-        return which, body, across[hit], at[hit]
+
+@twin_of(propagation_bodies.near)
+def near(starts, ends, before, total, places, radii, spared, wavelength, reach):
+    """Find the straight segments (K,) that pass a disc (N,) within `reach` Fresnel units of its
+    edge, unless `spared` (K or 1, N).
+
+    Parameters
+    ----------
+    starts, ends : (K, 3) of the segments [m]
+    before, total : (K,) distance along the path before the segment, and of the whole path [m]
+    places, radii : (N, 3) and (N,) of the discs [m]
+
+    Returns
+    -------
+    segment and disc of each pass, distance of the disc's centre and distance along the path [m]
+    """
+    span, to = ends - starts, places - starts[:, None]
+    square = np.maximum((span**2).sum(axis=1), np.finfo(float).tiny)[:, None]
+    dot = (to * span[:, None]).sum(axis=2)
+    across = np.sqrt(np.maximum((to**2).sum(axis=2) - dot**2 / square, 0.0))
+    at = before[:, None] + dot / np.sqrt(square)
+    first, rest = np.maximum(at, radii), np.maximum(total[:, None] - at, radii)
+    edge = reach * np.sqrt(wavelength * first * rest / (2 * (first + rest)))  # reach of the shadow
+    passed = (dot > 0) & (dot < square) & ~spared & (across - radii < edge)
+    segment, disc = np.nonzero(passed)
+    return segment, disc, across[passed], at[passed]
