@@ -156,7 +156,8 @@ class _Reader:
         return merged | values
 
     def _merged(self, node: yaml.MappingNode, key: Key, depth: int) -> dict[str, Any]:
-        """What a mapping takes over by its key `<<` from others; the first of a list wins."""
+        """Return the keys that a mapping takes from others by its key `<<`; the first of a list
+        wins."""
         merged: dict[str, Any] = {}
         for name, item in node.value:
             if not _merges(name):
@@ -171,7 +172,7 @@ class _Reader:
 
 
 def _merges(name: yaml.Node) -> bool:
-    """Whether a key is YAML's `<<`."""
+    """Tell whether a key is YAML's `<<`."""
     return isinstance(name, yaml.ScalarNode) and name.value == "<<" and not name.style
 
 
@@ -376,8 +377,8 @@ class Document:
         raise ScenarioError("\n".join([*lines[:MAX_MESSAGES], *end]))
 
     def complaint(self, problem: Problem, below: Key = ()) -> str:
-        """What is wrong, with its place. The first key is named; the place is that of an option if
-        one set any of the keys, else of the first key that the file holds."""
+        """Say what is wrong, with its place. The first key is named; the place is that of an option
+        if one set any of the keys, else of the first key that the file holds."""
         return self._line([below + key for key in problem.keys], problem.text)
 
     def _line(self, keys: Sequence[Key], text: str) -> str:
@@ -409,7 +410,7 @@ class Document:
 
 
 def _said(root: type[Node], key: Key, found: Any) -> str:
-    """What pydantic found, in words for people."""
+    """Say in plain words what pydantic found."""
     kind = found["type"]
     instead = _instead_of_removed(root, key, found["input"])
     if instead is not None:
@@ -486,7 +487,7 @@ def _names_allowed(root: type[BaseModel], key: Iterable[str | int]) -> list[str]
 
 
 def _instead_of_removed(root: type[BaseModel], key: Key, value: Any) -> str | None:
-    """What to write instead of a key or a value that earlier versions had."""
+    """Return what to write instead of a key or a value that earlier versions had."""
     model = _model_at(root, key[:-1]) if key else None
     if model is None or not issubclass(model, Node):
         return None

@@ -71,7 +71,7 @@ _NO_MORE = re.compile("out of memory|can't start new thread", re.IGNORECASE)
 
 
 def shortly(problem: BaseException) -> str:
-    """What a library says of a bad file, in one line of at most 300 characters."""
+    """Shorten a library's message about a bad file to one line of at most 300 characters."""
     return " ".join(str(problem).split())[:300]
 
 
@@ -114,8 +114,8 @@ def _ask_glibc(function: str, *arguments: int) -> None:
 
 
 class UserError(Exception):
-    """What the user can mend: the text says what, where, the limit and the remedy. The command
-    line prints it alone and exits with 2."""
+    """Error that the user can mend: the text says what, where, the limit and the remedy. The
+    command line prints it alone and exits with 2."""
 
 
 class MissingPackage(UserError, ModuleNotFoundError):
@@ -147,8 +147,8 @@ class RuntimeProblem(MachineProblem):
 
 
 def of_machine(problem: BaseException) -> bool:
-    """Whether the machine is to blame for an error and not what was asked of it, also where
-    another error was made of the machine's.
+    """Return whether the machine caused an error and not the request, also where another error was
+    made of the machine's.
 
     Examples
     --------
@@ -169,7 +169,7 @@ def of_machine(problem: BaseException) -> bool:
 
 @dataclass(frozen=True)
 class Backend:
-    """What Dr.Jit will run on.
+    """Back end that Dr.Jit runs on.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def _version_in_name(path: str) -> int | None:
 
 
 def _ask(program: str, *arguments: str) -> str | None:
-    """What a Python program prints in a process of its own; None when it fails or dies."""
+    """Return what a Python program prints in a process of its own; None when it fails or dies."""
     try:
         done = subprocess.run(
             [sys.executable, "-I", "-S", "-c", program, *arguments],

@@ -79,11 +79,11 @@ class Node(BaseModel):
         return self
 
     def problems(self) -> Iterator[Problem]:
-        """What in this mapping contradicts itself; keys are relative to it."""
+        """List contradictions within this mapping; keys are relative to it."""
         yield from ()
 
     def applies(self, name: str) -> bool:
-        """Whether a field means anything beside the values of the others."""
+        """Return whether a field has an effect besides the values of the others."""
         return True
 
 

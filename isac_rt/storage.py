@@ -94,8 +94,8 @@ class CacheWarning(UserWarning):
 
 @lru_cache
 def is_own_folder(folder: Path) -> bool:
-    """Whether only this user, or root, can put files into a folder or another folder in its place;
-    a warning says why not.
+    """Return whether only this user, or root, can put files into a folder or another folder in its
+    place; a warning says why not.
 
     The folder and all above it are looked at, with links and without; a folder above may be one
     that others write where each can remove only their own, as `/tmp`.
@@ -138,7 +138,7 @@ def _name_of(user: int) -> str:
 
 
 def _is_private_group(group: int) -> bool:
-    """Whether a group is this user's alone, as many systems give to each."""
+    """Return whether a group is this user's alone, as many systems give to each."""
     try:
         user, found = pwd.getpwuid(os.geteuid()), grp.getgrgid(group)
     except KeyError:
@@ -247,8 +247,8 @@ def save_data(file: Path, key: str, value: Any) -> None:
 
 
 def load_data(file: Path, key: str) -> Any | None:
-    """What `save_data` kept under a key; None where it is not there, or not whole, or was kept
-    under another key."""
+    """Return the data that `save_data` kept under a key; None where it is missing, incomplete, or
+    was kept under another key."""
     try:
         content = read_whole(file)
     except OSError:
@@ -310,7 +310,7 @@ class Store:
     limit: int
 
     def get(self, key: str) -> Any | None:
-        """What was kept under a key; None where it is not (or no longer) here."""
+        """Return the data kept under a key; None where it is not (or no longer) here."""
         file = self._file(key)
         found = load_data(file, key)
         if found is not None:
@@ -354,8 +354,8 @@ others put things there too, and a look at thousands of files takes 10 ms."""
 
 
 def kept(what: str, depends_on: Any, make: Callable[[], Any]) -> Any:
-    """What `make` returns, plain data and arrays, or what it returned in an earlier run for the
-    same `depends_on`, plain data and arrays too."""
+    """Return what `make` returns, plain data and arrays, or what it returned in an earlier run for
+    the same `depends_on`, plain data and arrays too."""
     named = os.environ.get(KEPT)
     if named is None:
         try:

@@ -1,2 +1,1 @@
-"""What is sent when and by which antenna: the waveform, the payload, the timetable, and the samples
-of a frame."""
+"""Waveform, payload, timetable, antennas and the samples of a frame."""

@@ -135,7 +135,7 @@ class Antennas:
 
     @property
     def is_l(self) -> bool:
-        """Whether both arrays are an L, whose arms can be looked at one by one."""
+        """True if both arrays are an L, whose arms can be processed one by one."""
         return self.tx_places is None and self.rx_places is None
 
     @property
@@ -182,8 +182,8 @@ class Antennas:
         return wavelength / step if step else np.inf
 
     def observes(self, passes: int) -> tuple[bool, bool]:
-        """Whether directions along X and along Z can be told at all: the channels of an echo
-        (passes = 2), or the receive elements for one pass, do not all stand at one place there."""
+        """Return whether directions along X and along Z are observable: the channels of an echo
+        (passes = 2), or the receive elements for one pass, span that axis."""
         return _observes(self, passes)
 
     @property
@@ -192,7 +192,7 @@ class Antennas:
         return float(np.sin(min(self.half_view, np.pi / 2)))
 
     def in_view(self, direction: np.ndarray) -> np.ndarray:
-        """Whether body-frame unit vectors (..., 3) lie inside the field of view of both arms."""
+        """Mark the body-frame unit vectors (..., 3) in the field of view of both arms."""
         limit = self.view_limit
         return (
             (direction[..., 1] > 0)
@@ -202,7 +202,7 @@ class Antennas:
 
     @property
     def look_back(self) -> bool:
-        """Whether elements send and hear anything behind the plane across their boresight."""
+        """True if elements radiate or receive behind the plane across their boresight."""
         return self.pattern == "isotropic" or (self.pattern != "sector" and self.table is not None)
 
     def element_gain(self, direction: np.ndarray) -> np.ndarray:

@@ -100,7 +100,8 @@ class Reference:
 
 @dataclass(frozen=True, kw_only=True)
 class IFCube:
-    """What a receiver's converters deliver in one frame. It never holds the payload.
+    """Samples of one receiver in one frame, as its converters deliver them. It never holds the
+    payload.
 
     Attributes
     ----------
@@ -125,7 +126,7 @@ class IFCube:
         return SharedCube(**vars(self))
 
     def of_groups(self, groups: Sequence[int]) -> IFCube:
-        """What a receiver of these groups alone has."""
+        """Return the part that a receiver of these groups alone has."""
         chosen = list(groups)
         return IFCube(
             samples=self.samples[chosen],

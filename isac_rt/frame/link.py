@@ -19,13 +19,12 @@ class Link(NamedTuple):
 
     @property
     def own(self) -> bool:
-        """Whether the receiver hears its own chirps."""
+        """True if the receiver receives its own chirps."""
         return self.tx == self.rx
 
     @property
     def passes(self) -> int:
-        """How often a wave passes the range that is reported: 2 for echoes, 1 from terminal to
-        terminal."""
+        """Number of passes of the reported range: 2 for echoes, 1 from terminal to terminal."""
         return 2 if self.own else 1
 
     def __str__(self) -> str:

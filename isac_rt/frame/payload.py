@@ -15,7 +15,7 @@ MODULATION_ORDERS = (2, 4, 8, 16)
 
 @dataclass(frozen=True)
 class Payload:
-    """What one frame carries.
+    """Bits and symbols that one frame carries.
 
     Attributes
     ----------

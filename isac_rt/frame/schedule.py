@@ -1,4 +1,4 @@
-"""Which antenna sends when: schedules of TDM-MIMO, and the codes of antennas that send at once."""
+"""Schedules of TDM-MIMO (which antenna sends when), and the codes of antennas that send at once."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def pseudo_random_schedule(
 
 
 def is_latin(schedule: Schedule, num_tx: int) -> bool:
-    """Whether no slot uses an antenna twice (then, with M = num_tx, the union of the groups samples
-    every antenna in every slot)."""
+    """Return whether no slot uses an antenna twice (then, with M = num_tx, the union of the groups
+    samples every antenna in every slot)."""
     ordered = np.sort(schedule, axis=0)
     return bool((ordered[1:] > ordered[:-1]).all() and schedule.max() < num_tx)
 

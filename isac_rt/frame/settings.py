@@ -422,12 +422,12 @@ class Array(Node):
 
     @property
     def is_l(self) -> bool:
-        """Whether both arrays are an L."""
+        """True if both arrays are an L."""
         return self.tx is None and self.rx is None
 
     @property
     def is_full_l(self) -> bool:
-        """Whether both arrays are an L whose receive arms tell directions on both axes."""
+        """True if both arrays are an L whose receive arms observe directions on both axes."""
         return self.is_l and self.rx_x > 1 and self.rx_z > 1
 
     def applies(self, name: str) -> bool:
@@ -487,7 +487,7 @@ class Modulation(Node):
 
 
 class Noise(Node):
-    """How strong the receiver's noise is: by a link budget in watts, or by a stated SNR."""
+    """Strength of the receiver's noise: by a link budget in watts, or by a stated SNR."""
 
     REMOVED: ClassVar[dict[str, str]] = {
         "temperature_k": "noise_figure_db, which counts from 290 K: 10 log10(F - 1 + T/290)"

@@ -61,8 +61,8 @@ class Timetable:
         return self.start_time(frame, active) + self.waveform.frame_duration / 2
 
     def modulated(self, frame: int) -> bool:
-        """Whether a frame carries data: all but the periodic pilots and the acquisition frames at
-        the start and after a change of roles, and none of a plain radar."""
+        """Return whether a frame carries data: all but the periodic pilots and the acquisition
+        frames at the start and after a change of roles, and none of a plain radar."""
         every = self.modulation.pilot_every_frames
         pilot = every is not None and frame % every == 0
         if not self.waveform.carries_data:
@@ -126,7 +126,8 @@ class Timetable:
         ]
 
     def holds(self, link: Link, frame: int) -> bool:
-        """Whether the roles of a frame have a link, even where its own terminal skips the frame."""
+        """Return whether the roles of a frame have a link, even where its own terminal skips the
+        frame."""
         return link in self._links(frame, own=True)
 
     @cached_property
@@ -150,8 +151,8 @@ class Timetable:
         return None if chosen is None or link.own else tuple(sorted(chosen))
 
     def payload(self, active: str, frame: int, schedule: Schedule | None = None) -> Payload:
-        """What an active terminal's chirps carry in a frame; `schedule`: if it is another than the
-        usual one. The bits are the same."""
+        """Return the payload of an active terminal's chirps in a frame; `schedule`: if it is
+        another than the usual one. The bits are the same."""
         if not self.modulated(frame):
             return unmodulated(self.waveform)
         rng = generator(self.seed, "payload", active, frame)

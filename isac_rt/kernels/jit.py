@@ -144,7 +144,8 @@ def twin_of(kernel: Callable) -> Callable[[Callable], Callable]:
 
 @lru_cache
 def digest(module: str) -> str:
-    """Of the source of all that a module's machine code depends on; it and what it calls."""
+    """Digest the source of all that a module's machine code depends on: the module and what it
+    calls."""
     root = Path(__file__).parents[1]
     chosen = [root.joinpath(*module.split(".")[1:]).with_suffix(".py")]
     for path in chosen:  # grows while it is read
@@ -162,7 +163,7 @@ _source = cache(Path.read_bytes)
 
 @cache
 def _compiles(path: Path) -> bool:
-    """Whether a file has compiled functions."""
+    """Return whether a file has compiled functions."""
     return _COMPILES.search(_source(path)) is not None
 
 

@@ -102,9 +102,10 @@ def _place(corners, state, point):
 
 @jit(borrows=True)
 def _near(corners, limit, places, boxes, span):
-    """Whether a place is nearer than `limit` to a triangle (3, 3): to the nearest point of a sphere
-    about its centroid that holds it. Places are asked only where `span`, between which the distance
-    from the centroid to the nearest place lies, leaves it open; it is then known."""
+    """Return whether a place is nearer than `limit` to a triangle (3, 3): to the nearest point of a
+    sphere about its centroid that holds it. `span` bounds the distance from the centroid to the
+    nearest place; places are searched only where it leaves the answer open, and it is exact
+    afterwards."""
     x, y, z = _middle(corners, 0), _middle(corners, 1), _middle(corners, 2)
     reach = 0.0
     for k in range(3):

@@ -11,8 +11,9 @@ ONE = np.uint64(1)
 
 @jit
 def merged(face, code, halvings, area, amplitude, clock, limit):
-    """Which cells (N,), each before what is halved from the next, stand for what is left, its area
-    and its amplitude. The cell whose clock rings first is drawn by area, whatever it is among."""
+    """Return which cells (N,), each followed by those halved from it, represent the rest, their
+    area and amplitude. Cells are drawn by exponential clocks in proportion to their area, whatever
+    group they are in."""
     count = 0
     places, areas = np.empty(area.size, np.int64), np.empty(area.size)
     amplitudes = np.empty(area.size, np.complex128)

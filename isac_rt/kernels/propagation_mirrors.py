@@ -43,8 +43,8 @@ def on_the_wall(points, place, normal, offset, corners):
 
 @jit(inline=True)
 def _inside(x, y, z, corners, normal):
-    """Whether a point of the plane is in a triangle, whichever way round its corners go; seams
-    belong to both sides."""
+    """Return whether a point of the plane is in a triangle of either winding; seams belong to both
+    sides."""
     least, most = np.inf, -np.inf
     for k in range(3):
         a, b = corners[k], corners[(k + 1) % 3]

@@ -27,10 +27,10 @@ def hides(sides, row, box, places, points, out):
 
 @jit(inline=True)
 def _hidden_from(side, point, places):
-    """Whether a triangle surely hides a point from all places: their rays do not graze it, and meet
-    it farther than `SURE` inside its sides and from both ends, even if they leave the point
-    `LIFT` aside. All this is linear or convex in the place, so it holds between those where it
-    holds."""
+    """Return whether a triangle surely occludes a point from all places: their rays do not graze
+    it, and meet it farther than `SURE` inside its sides and from both ends, even if they leave the
+    point `LIFT` aside. Each condition is linear or convex in the place, so it holds between places
+    where it holds."""
     x, y, z = point
     (ax, ay, az, a), (bx, by, bz, b), (cx, cy, cz, c), (dx, dy, dz, d) = side
     level = x * ax + y * ay + z * az - a

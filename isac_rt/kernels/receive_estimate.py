@@ -38,7 +38,7 @@ class Chirps(NamedTuple):
 
 
 class WindowAxis(NamedTuple):
-    """What a template depends on of the waveform, the window's cells to a range cell, and the first
+    """Parameters of a template from the waveform: the window's cells per range cell, and the first
     row."""
 
     carrier: float
@@ -91,10 +91,10 @@ def gather(spectra, low, share, chirps):
 
 @jit(fast=True, borrows=True)
 def _template(chirps, axis, first, delay, delay_rate, steps, out):
-    """Of a path in the sixteen chirps from `first` on, sixteen float32 each: weighted cosine and
-    sine, weight times the sum of the rows' squared factors, and the rows' real factors. Beat, phase
-    and `hann_response`; a test holds them against these. `steps` : cosine and sine from the first
-    row to each."""
+    """Fill a path's template for the sixteen chirps from `first` on, sixteen float32 each: weighted
+    cosine and sine, weight times the sum of the rows' squared factors, and the rows' real factors.
+    Beat, phase and `hann_response`; a test holds them against these. `steps` : cosine and sine from
+    the first row to each."""
     carrier, slope, middle, duration, length, share, low = axis
     weight, tau = narrow(load(chirps.weight, first)), delay + delay_rate * load(chirps.time, first)
     near = (slope * tau + delay_rate * (carrier + slope * (middle - tau))) * duration

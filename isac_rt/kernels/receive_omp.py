@@ -30,8 +30,8 @@ def pursue(first, gram_re, gram_im, support, amplitude):
 
 @jit(fast=True, borrows=True)
 def _powers(first, short, chosen, x, power):
-    """Of all bins the correlation's square once the atoms `chosen`, of amplitudes x, are out; -1
-    where they lie and after the last bin. `short` is the Gram in float32."""
+    """Return the squared correlation of all bins once the atoms `chosen`, of amplitudes x, are
+    subtracted; -1 where they lie and after the last bin. `short` is the Gram in float32."""
     (gram_re, gram_im), num_chirps = short, short[0].size // 3
     for p in range(0, power.size, LANES):
         a, b = load(first, 2 * p), load(first, 2 * p + LANES)

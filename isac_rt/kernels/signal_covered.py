@@ -545,7 +545,7 @@ def _spread(grids, desk, count, c, sheet, lane):
 
 @jit(fast=True, borrows=True)
 def _send(desk, chirps, link, offset, t, w):
-    """What reaches the chirps of a batch from a link's transmitter, so many groups apart."""
+    """Compute the signals that reach the chirps of a batch from a link's transmitter, per group."""
     groups, num_chirps = t.send.shape[1:]
     desk.antenna[:] = -1
     for c in range(chirps.shape[0]):

@@ -83,7 +83,7 @@ _BELOW = 1 - 1e-14  # keeps a frequency that is rounded up to a whole turn on th
 
 
 class Kernel(NamedTuple):
-    """What spreads tones on a grid and what divides its response out.
+    """Window that spreads tones on a grid, and the division by its response.
 
     Attributes
     ----------
@@ -188,8 +188,8 @@ def _real_least_squares(matrix: np.ndarray, goals: np.ndarray) -> np.ndarray:
 
 
 class _Grid(NamedTuple):
-    """How chirps are gridded: half their samples, mean of x^2, one 0 per grid point of a path,
-    `weights`, the `plan` of the transform, and in which order chirps are made."""
+    """Layout of gridded chirps: half their samples, mean of x^2, one 0 per grid point of a path,
+    `weights`, the `plan` of the transform, and the order in which chirps are made."""
 
     half: float
     centre: float
@@ -235,8 +235,8 @@ class _Faint(NamedTuple):
 
 
 class _Heard(NamedTuple):
-    """What is heard: blocks of paths, the `_steering` of these, what noise covers, and what is
-    added past the grid."""
+    """Received paths: blocks of them, their `_steering`, the below-noise paths, and what is added
+    past the grid."""
 
     blocks: _Blocks
     steer: np.ndarray
@@ -258,8 +258,8 @@ class _Room(NamedTuple):
 
 @jit(fast=True, borrows=True)
 def _prepare(work, places, b, block, w, g, time, symbol, send, antenna):
-    """Of 16 paths: place on the grid to `places`; distance from the middle of the cell, complex
-    factor (less the filter's gain), quadratic term [rad] and lambda, 16 floats of each, to
+    """Prepare 16 paths: place on the grid to `places`; distance from the middle of the cell,
+    complex factor (less the filter's gain), quadratic term [rad] and lambda, 16 floats of each, to
     `work`."""
     f_c, slope, ts, u = w.carrier, w.slope, w.step, w.middle
     half, size = g.half, g.rows.shape[0]
@@ -327,7 +327,7 @@ def _weigh(work, scratch, poly, taps):
 
 @jit(inline=True)
 def _centred(steer, work, i, k):
-    """Of path i: its amplitude at every element about the middle of the chirp (real, imaginary),
+    """Return path i's amplitude at every element about the middle of the chirp (real, imaginary),
     theta and q."""
     ar, ai, theta = load(steer, k), load(steer, k + 16), load(steer, k + 32)
     c, s, late = splat(work[16 + i]), splat(work[32 + i]), theta * splat(work[64 + i])
@@ -497,7 +497,7 @@ def _steering(
 
 
 def _blocks(waveform: Any, t: Any, path: np.ndarray, offset: np.ndarray) -> _Blocks:
-    """Of the listed paths and their offsets."""
+    """Group the listed paths into blocks and return their offsets."""
     w = waveform
     order = np.lexsort((t.delay[path], offset, t.link[path]))
     path, offset = path[order], offset[order]

@@ -69,8 +69,8 @@ def _dot(a, b):
 
 @jit
 def _within(a, b, share, low, high, out):
-    """Whether the place at a share of the way from a to b, put into `out`, is in a box or within
-    `EDGE` of it."""
+    """Return whether the point at a share of the segment from a to b, put into `out`, is in a box
+    or within `EDGE` of it."""
     for c in range(3):
         out[c] = a[c] + (b[c] - a[c]) * share
         if not low[c] - EDGE <= out[c] <= high[c] + EDGE:

@@ -52,7 +52,7 @@ def group_planes(corners: NDArray, normals: NDArray, offsets: NDArray, tolerance
 def _count_near(
     x: NDArray, y: NDArray, z: NDArray, nx: float, ny: float, nz: float, d: float, most: float
 ) -> int:
-    """How many points are near a plane, but for rounding; the compiler takes many at once."""
+    """Count the points near a plane up to rounding; the compiler vectorises it."""
     count = 0
     for i in range(x.size):
         count += abs(nx * x[i] + ny * y[i] + nz * z[i] - d) <= most

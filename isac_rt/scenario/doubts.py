@@ -1,5 +1,5 @@
-"""What may stand in a scenario but is probably not meant: values that look as if they were in
-another unit (by a factor of a thousand for most keys), and settings that never act."""
+"""Doubts about a scenario: values that look as if they were in another unit (by a factor of a
+thousand for most keys), and settings that have no effect."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ FARTHEST_M = 1e5
 
 
 def doubts(scenario: Scenario) -> Iterator[Problem]:
-    """What a person should be asked about a scenario."""
+    """List what a person should be asked about a scenario."""
     for (a, first), (b, second) in combinations(scenario.first_blocks().items(), 2):
         if abs(first - second) < scenario.radio.groups:
             said = f"{b} and {a} send in the same resource blocks; shall they collide?"
@@ -112,8 +112,8 @@ def _middle(scenario: Scenario) -> tuple[float, float, float]:
 
 
 def _can_fall_back(scenario: Scenario) -> bool:
-    """Whether a receiver of this scenario ever judges sparsity: some have fewer groups than there
-    are transmit antennas."""
+    """Return whether a receiver of this scenario ever tests sparsity: some have fewer groups than
+    there are transmit antennas."""
     m = scenario.modulation
     partial = scenario.radio.groups < scenario.num_tx or any(
         len(groups) < scenario.num_tx for groups in m.streams.values()

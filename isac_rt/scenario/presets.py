@@ -74,8 +74,8 @@ class ReceiverSet(Node):
 
 
 def with_preset(stated: dict[str, Any], named: Any, own: dict[str, Any]) -> dict[str, Any]:
-    """What a file states of a set of receivers, with what the preset `named` says and `own`
-    settings say of the rest. What is malformed stays as it is, for whoever checks it."""
+    """Return a file's settings of a set of receivers, completed by the preset `named` and by `own`
+    settings. Malformed parts stay as they are, for the validation."""
     said = PRESETS.get(named, {}) if isinstance(named, str) else {}
     out = dict(stated)
     for key in ("receivers", "tracking"):

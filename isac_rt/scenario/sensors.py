@@ -110,8 +110,8 @@ SENSORS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 def with_sensor(stated: dict[str, Any]) -> dict[str, Any]:
-    """What a file states, with what its `sensor` says of the rest. What is malformed stays as it
-    is, for whoever checks it."""
+    """Return a file's settings, completed by its `sensor`. Malformed parts stay as they are, for
+    the validation."""
     name, out = stated.get("sensor"), dict(stated)
     if not isinstance(name, str) or name.lower() not in SENSORS:
         return out

@@ -260,7 +260,7 @@ class Scenario(Node):
             )
 
     def _code_problems(self) -> Iterator[Problem]:
-        """What antennas that send at once need."""
+        """List what antennas that send at once lack."""
         r, sizes = self.radio, (("array", "tx_x"), ("array", "tx_z"))
         bands = r.bands(self.num_tx)
         if bands < self.num_tx:
@@ -276,7 +276,7 @@ class Scenario(Node):
             )
 
     def _fmcw_problems(self) -> Iterator[Problem]:
-        """What a plain radar does not have, and what its receivers cannot do."""
+        """List what a plain radar does not have, and what its receivers cannot do."""
         r = self.radio
         if r.mode == "isac":
             return
@@ -571,7 +571,7 @@ class Scenario(Node):
 
     @property
     def needs_mesh(self) -> bool:
-        """Whether some terminal predicts clutter from the city's mesh."""
+        """True if some terminal predicts clutter from the city's mesh."""
         sets = self._all_receivers().values()
         traced = self.propagation.model == "ray_traced" and self.city is not None
         by_beams = traced and any(one.passive_detector == "beams" for one in sets)
@@ -579,8 +579,8 @@ class Scenario(Node):
 
 
 def _fits(key: str, value: str, values: tuple[str, ...]) -> bool:
-    """Whether a setting of receivers has one of some values, or names another package's part, of
-    which nothing is known."""
+    """Return whether a setting of receivers has one of some values, or names another package's
+    part, of which nothing is known."""
     return value in values or (key in _PARTS and value not in _PARTS[key].own)
 
 
@@ -631,7 +631,7 @@ def _descendants(node: type[Node]) -> Iterator[type[Node]]:
 
 
 def _docstrings(node: type[Node]) -> dict[str, str]:
-    """What stands under each field of a node and of those that it extends.
+    """Return the text under each field of a node and of those that it extends.
 
     The source is read here, for the schema alone: pydantic's `use_attribute_docstrings` does it for
     each model at every import.

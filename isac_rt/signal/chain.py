@@ -1,4 +1,4 @@
-"""What hardware does to samples behind the antennas: phases, gains, ramps, noise, amplifier and
+"""Effects of hardware on samples behind the antennas: phases, gains, ramps, noise, amplifier and
 converter, chirp by chirp."""
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Turns:
     gain: np.ndarray | None = None
 
     def of_rows(self, every: int) -> Turns:
-        """Those of one chirp in `every`."""
+        """Return the rows of one chirp in `every`."""
         rows = {name: getattr(self, name) for name in ("beat", "antenna", "begin")}
         return replace(
             self,
@@ -104,7 +104,7 @@ class Turns:
 
 @dataclass(frozen=True)
 class Work:
-    """What one pass through the samples does, in this order.
+    """Steps of one pass through the samples, in this order.
 
     Attributes
     ----------

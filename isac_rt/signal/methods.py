@@ -129,7 +129,8 @@ class Auto:
         return _made(waveform, tones, noise, *self.choose(waveform, tones))
 
     def choose(self, waveform: Waveform, tones: Tones) -> tuple[np.ndarray, np.ndarray]:
-        """Which paths go one by one, and which of the others noise covers, (K,) bool each."""
+        """Return which paths are synthesised one by one, and which of the others are below the
+        noise, (K,) bool each."""
         every, elements = np.ones(tones.size, bool), tones.rx_delay.shape[1]
         size = float(np.prod(_shape(waveform, tones)))
         error = ERROR_AT_REST + ERROR_PER_SPEED * tones.speed(waveform.frame_duration)
@@ -149,7 +150,7 @@ Method = Exact | Direct | Gridded | Auto | Separable
 
 
 def _strongest(power: np.ndarray, count: int) -> np.ndarray:
-    """Which (K,) of some powers are the strongest, so many of them; of equal ones the first."""
+    """Mark the `count` strongest (K,) of some powers; of equal ones the first."""
     out = np.zeros(power.size, bool)
     out[np.argsort(-power, kind="stable")[:count]] = True
     return out
@@ -161,7 +162,7 @@ def _shape(waveform: Waveform, tones: Tones) -> tuple[int, ...]:
 
 
 def _covered(waveform: Waveform, tones: Tones, limit: float) -> np.ndarray:
-    """Which paths (K,) noise covers: the powers [W] of the errors that all paths of their
+    """Mark the paths (K,) below the noise: the powers [W] of the errors that all paths of their
     range-Doppler cell would have stay within a limit."""
     error = covered_error(waveform, tones, grid_size(waveform.num_samples, OVERSAMPLING, WIDTH))
     cell = resolution_cell(waveform, tones.delay, tones.rate)

@@ -54,7 +54,8 @@ def received(
     method: Method,
     noise: WhiteNoise,
 ) -> IFCube:
-    """What a receiver with real hardware has of real transmitters in one frame, noise included.
+    """Return the samples of a receiver with real hardware of real transmitters in one frame, noise
+    included.
 
     Parameters
     ----------
@@ -98,8 +99,8 @@ def _lag(tones: Tones) -> np.ndarray:
 
 
 def _turns(w: Waveform, tones: Tones, ends: Ends) -> Turns:
-    """What turns and scales the samples of all receive elements alike, oscillators apart: gains
-    over the chirp, and the difference of the two ramps."""
+    """Return the phase and gain that all receive elements share, oscillators excluded: gains over
+    the chirp, and the difference of the two ramps."""
     sender, out = ends.senders[0] if ends.senders else IDEAL, Turns()
     if sender.transmit_response is not None:
         late = np.rint(_lag(tones) * w.sampling_rate).astype(np.int64)
@@ -153,7 +154,7 @@ def _work(
     noise: WhiteNoise,
     samples: np.ndarray,
 ) -> Work:
-    """What the pass through the `samples` has to do."""
+    """List the steps of the pass through the `samples`."""
     work = Work(turns=turns, noise=noise)
     ramp = ends.senders[0].ramp if ends.senders else None
     if ramp is not None:
@@ -339,7 +340,7 @@ class _Flicker:
 
 
 def _strongest(power: np.ndarray, noise_power: float) -> np.ndarray:
-    """Which paths' noise within a chirp (K,) [W] asks for samples of their own."""
+    """Mark the paths (K,) whose noise within a chirp [W] needs samples of its own."""
     strongest = np.argsort(-power, kind="stable")[:MOST_ALONE]
     return strongest[power[strongest] > SHARE * noise_power]
 

@@ -10,8 +10,8 @@ from isac_rt.settings import Node, Positive
 
 
 class Accuracy(Node):
-    """How near to the full model a run has to come. What the scene then needs is decided link by
-    link and frame by frame; `isac-rt plan` shows it."""
+    """Required accuracy of a run against the full model. What the scene then needs is decided link
+    by link and frame by frame; `isac-rt plan` shows it."""
 
     REMOVED: ClassVar[dict[str, str]] = {
         "preset: fastest": "budget; with propagation.weakest_path_db: 0 it leaves out most",

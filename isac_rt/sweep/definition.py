@@ -1,5 +1,5 @@
-"""What a sweep is: a base scenario, axes, repetitions; its points and the key under which each is
-kept."""
+"""Definition of a sweep: a base scenario, axes, repetitions; its points and the key under which
+each is kept."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Axis(Free):
         return set(self.zip) if self.zip is not None else {str(self.key)}
 
     def entry(self, index: int) -> dict[str, Any]:
-        """What the axis sets at one of its entries."""
+        """Return the settings of the axis at one of its entries."""
         if self.list is not None:
             return next(itertools.islice(self.list.values(), index, None))
         if self.zip is not None:
@@ -263,8 +263,8 @@ class Plan:
 
 
 def ground_of(tree: dict[str, Any], folder: Path) -> dict[str, str]:
-    """What a point's outcome depends on beside its scenario: the program, the versions under it,
-    and digests of the files that the scenario names.
+    """Return what a point's outcome depends on besides its scenario: the program, the versions
+    under it, and digests of the files that the scenario names.
 
     Parameters
     ----------

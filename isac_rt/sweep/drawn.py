@@ -1,5 +1,5 @@
-"""What a data set is: many scenes drawn from one scenario, each in one of several splits that share
-no flight and no street."""
+"""Definition of a data set: many scenes drawn from one scenario, each in one of several splits that
+share no flight and no street."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ class Place(Free):
 
     @property
     def num_cells(self) -> int:
-        """How many cells there are."""
+        """Count the cells."""
         return math.prod(self.sides)
 
     @property

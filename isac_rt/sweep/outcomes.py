@@ -45,13 +45,13 @@ Count = Annotated[int, Field(ge=0, lt=2**53)]
 
 
 class _Link(BaseModel):
-    """What the dataset takes of a link's outcome, beside the numbers in it."""
+    """Columns that the dataset takes of a link's outcome, besides the numbers in it."""
 
     counts: dict[str, tuple[Count, Count]]
 
 
 class _Outcome(BaseModel):
-    """What the dataset and the status take of an outcome."""
+    """Columns that the dataset and the status take of an outcome."""
 
     key: str
     status: Literal["done", "failed"]
@@ -101,7 +101,8 @@ class Outcomes:
         write_whole(self.file(key), json.dumps(kept) + "\n")
 
     def done(self, key: str, retry_failed: bool) -> bool:
-        """Whether a point needs no run: it succeeded, or it failed and is not to be tried again."""
+        """Return whether a point needs no run: it succeeded, or it failed and is not to be tried
+        again."""
         outcome = self.read(key)
         return outcome is not None and (not retry_failed or outcome["status"] == "done")
 
@@ -142,7 +143,7 @@ class Outcomes:
 
 @dataclass(frozen=True)
 class Status:
-    """How far a sweep is: counts of points, and the errors of those that failed (index along the
+    """Progress of a sweep: counts of points, and the errors of those that failed (index along the
     axes, message)."""
 
     total: int
@@ -262,7 +263,7 @@ def _rates(
 
 
 def _dataset(plan: Plan, variables: dict[str, xr.Variable], links: list[str]) -> xr.Dataset:
-    """What is kept of the variables, with the coordinates along the axes."""
+    """Return the kept variables as a dataset, with the coordinates along the axes."""
     sweep = plan.sweep
     kept = {
         name: v

@@ -71,7 +71,7 @@ def samples_of(
 
 
 def _truth(d: xr.Dataset, f: int, o: int) -> dict[str, Any]:
-    """What is true of every UAV in a frame on a link, and the axes of its map."""
+    """Return the truth of every UAV in a frame on a link, and the axes of its map."""
     seen = d.isel(frame=f, observer=o)
     own = d.transmitter.values[o], d.receiver.values[o]
     uavs = {
@@ -179,7 +179,7 @@ class Samples:
 
 
 def read_card(folder: Path) -> dict[str, Any]:
-    """What a finished data set says of itself.
+    """Read the card of a finished data set.
 
     Raises
     ------
@@ -220,7 +220,7 @@ _UNREADABLE = (
 
 
 def index_of(shard: Path) -> Index:
-    """What a shard holds, from the headers of its files.
+    """Index the contents of a shard from the headers of its files.
 
     Raises
     ------

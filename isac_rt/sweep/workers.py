@@ -32,8 +32,8 @@ class SchedulerLost(Exception):
 
 
 class Ended(NamedTuple):
-    """What came of a job: its outcome's status; `LEFT` with the reason, where the machine did not
-    let it end; or `LOST`, where its worker died."""
+    """End of a job: its outcome's status; `LEFT` with the reason, where the machine did not let it
+    end; or `LOST`, where its worker died."""
 
     status: str
     why: str = ""
