@@ -1,4 +1,4 @@
-"""What a run's frames use of the stages before them: blocks, links and clocks."""
+"""Results of the access stages that a run's frames use: blocks, links and clocks."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ side."""
 
 @dataclass(frozen=True)
 class Isolation:
-    """How far a neighbour is down after mixing and filtering.
+    """Attenuation of a neighbour by mixing and filtering.
 
     Attributes
     ----------

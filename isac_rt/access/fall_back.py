@@ -20,7 +20,7 @@ from isac_rt.receive.types import Reception
 
 @dataclass
 class Schedules:
-    """Which schedule each active terminal sends in the next frame.
+    """Schedule of each active terminal in the next frame.
 
     Attributes
     ----------

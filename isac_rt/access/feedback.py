@@ -32,7 +32,7 @@ is another's."""
 
 @dataclass(frozen=True)
 class Feedback:
-    """What a passive terminal sends back.
+    """Message that a passive terminal sends back.
 
     Attributes
     ----------

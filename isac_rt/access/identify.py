@@ -1,4 +1,4 @@
-"""Which resource blocks are taken: listening at the slot grid, and the choice of a free run.
+"""Detection of occupied resource blocks at the slot grid, and the choice of a free run.
 
 Data move a sender's beat from chirp to chirp, so energies cannot be added over chirps cell by cell.
 A chirp is *hot* when its strongest cell, added over antennas, stands out of its other cells; a
@@ -68,7 +68,7 @@ def choose_run(taken: np.ndarray, length: int, wished: int | None = None) -> int
 
 
 def consensus(heard: Sequence[T]) -> T | None:
-    """What most blocks agree on; None without any or with a tie."""
+    """Return the value that most blocks agree on; None without any or with a tie."""
     ranked = Counter(heard).most_common(2)
     if not ranked or (len(ranked) > 1 and ranked[0][1] == ranked[1][1]):
         return None

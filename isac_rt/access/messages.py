@@ -1,4 +1,5 @@
-"""What terminals tell each other of what they see, and how long a link takes to carry it.
+"""Messages between terminals about tracks and detections, and the time that a link takes to carry
+them.
 
 An active terminal's messages ride on its data frames, a passive one's go back by its feedback. A
 message is made of what its sender knows after a frame and leaves with the next; it takes as many
@@ -68,7 +69,7 @@ class Kept:
 
 @dataclass(frozen=True)
 class Said:
-    """What a terminal said of its own position and velocity (6,) at a time [s]."""
+    """Position and velocity (6,) that a terminal reported of itself at a time [s]."""
 
     time: float
     state: Gaussian
@@ -158,7 +159,7 @@ class Channel(Stateful):
 
 @dataclass
 class Notes(Stateful):
-    """What a terminal knows from itself and from others, and what it has told whom.
+    """Tracks that a terminal knows from itself and from others, and what it has reported to whom.
 
     Attributes
     ----------
@@ -238,9 +239,9 @@ class Notes(Stateful):
         return not ended and time - report.time <= HOLD_S
 
     def compose(self, listener: str, capacity: int) -> Message:
-        """What it tells a listener by a channel of `capacity` bits a frame: not what came from
-        there, and of the tracks those first that were not told for longest. One frame's fill, but
-        one track at least."""
+        """Compose the message to a listener over a channel of `capacity` bits a frame: nothing that
+        came from there, and first the tracks that were not reported for longest. One frame's fill,
+        but one track at least."""
         told = self.told.setdefault(listener, {})
         bare = Message(
             self.name,
@@ -260,13 +261,13 @@ class Notes(Stateful):
         return replace(bare, reports=chosen, left_out=len(new) - len(chosen))
 
     def ages(self, time: float) -> tuple[float, ...]:
-        """Of what it has from others and what counts [s]."""
+        """Return the ages of what others reported and is still valid [s]."""
         return tuple(time - report.time for report, via in self.reports.values() if via)
 
 
 @dataclass
 class Noted:
-    """What a terminal carries over of detections.
+    """State of the detections that a terminal carries over.
 
     Attributes
     ----------
@@ -281,8 +282,7 @@ class Noted:
 
 
 class Sightings(Stateful):
-    """What a terminal knows of the detections that others and it have made, and what it has told
-    whom.
+    """Detections of others and of the terminal itself, and what it has reported to whom.
 
     Attributes
     ----------
@@ -300,7 +300,7 @@ class Sightings(Stateful):
 
     @property
     def terminals(self) -> dict[str, Said]:
-        """What terminals said of themselves."""
+        """Return what terminals reported of themselves."""
         return self.state.terminals
 
     def stand(self, time: float, state: Gaussian) -> None:
@@ -345,7 +345,7 @@ class Sightings(Stateful):
         return self.tracker.at(time, known)
 
     def ages(self, time: float) -> tuple[float, ...]:
-        """Of the detections that it has from others and that count [s]."""
+        """Return the ages of the detections that others reported and are still valid [s]."""
         return tuple(
             time - look.time
             for look, via in self.state.looks.values()
@@ -354,9 +354,9 @@ class Sightings(Stateful):
         )
 
     def compose(self, listener: str, capacity: int) -> Message:
-        """What it tells a listener by a channel of `capacity` bits a frame: the newest frames first
-        and of each the strongest detections, those of confirmed tracks before all others. What does
-        not fit is not told later; one detection is told at least."""
+        """Compose the message to a listener over a channel of `capacity` bits a frame: the newest
+        frames first and of each the strongest detections, those of confirmed tracks before all
+        others. What does not fit is not sent later; one detection is sent at least."""
         terminals = {k: s for k, s in self.terminals.items() if listener not in (k, s.via)}
         bare = Message(self.name, terminals, {}, [])
         told = self.state.told.setdefault(listener, set())
@@ -381,7 +381,7 @@ class Sightings(Stateful):
 
 
 def _bits(look: Look, detections: int) -> int:
-    """Of a look with so many of its detections."""
+    """Count the bits of a dwell with a number of its detections."""
     return LOOK_BITS + NUMBER_BITS * len(look.kept) + DETECTION_BITS * detections
 
 

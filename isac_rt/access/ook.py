@@ -24,7 +24,7 @@ PREAMBLE = 2  # stretches: on, off
 
 @dataclass(frozen=True)
 class Message:
-    """What is said: who speaks, and the first resource block that it speaks of."""
+    """Content of a message: the sender, and the first resource block that it names."""
 
     sender: int
     block: int
@@ -109,7 +109,7 @@ def keyed(waveform: Waveform, bits: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Reading:
-    """What a receiver made of a frame.
+    """Result of demodulating a frame.
 
     Attributes
     ----------

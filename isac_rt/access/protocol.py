@@ -131,7 +131,7 @@ class Network:
 
 @dataclass(frozen=True)
 class LinkState:
-    """What became of one link.
+    """Outcome of one link.
 
     Attributes
     ----------
@@ -345,7 +345,7 @@ def _join(air: _Air, at: str, block: int) -> dict[Link, LinkState]:
 def _announce(
     air: _Air, said: Message, pts: Sequence[str]
 ) -> dict[str, tuple[int, Message] | None]:
-    """What each passive terminal made of the announcement: (first block on its own grid,
+    """Return what each passive terminal decoded of the announcement: (first block on its own grid,
     message)."""
     n, w = air.n, air.n.waveform
     mask = keyed(w, n.codebook.encode(said))

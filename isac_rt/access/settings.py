@@ -10,8 +10,7 @@ from isac_rt.settings import Node
 
 
 class Access(Node):
-    """How the terminals find each other before the first frame, and what they tell each other
-    later."""
+    """Access of the terminals before the first frame, and the messages between them later."""
 
     establish: bool = False
     """Whether the stages before the data are simulated: active terminals listen for free resource

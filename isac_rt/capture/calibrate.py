@@ -1,4 +1,4 @@
-"""What a board does to its samples, found from the echo of one strong reflector.
+"""Calibration of a board from the echo of one strong reflector.
 
 Whatever the array and whatever error each antenna has, one point seen by it gives a matrix of
 receivers times transmitters of rank one: amplitude g_r h_t and delay d_r + e_t. What of the echo
@@ -48,7 +48,7 @@ KEY = "calibration 1"
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """What one reflector says of a board.
+    """Errors of a board that one reflector shows.
 
     A sample of receiver r and transmitter t at x = -1 .. 1 of the sweep is that of an ideal board
     times ``rx_gain[r] tx_gain[t] (1 + slope x)``, of an echo that is `rx_delay[r]` + `tx_delay[t]`
@@ -203,7 +203,7 @@ def _centred(values: np.ndarray) -> np.ndarray:
 
 
 def _levelled(gain: np.ndarray) -> np.ndarray:
-    """Of mean level 0 dB and mean phase about 0."""
+    """Normalise to a mean level of 0 dB and a mean phase of about 0."""
     turn = gain.sum() / abs(gain.sum())
     return np.asarray(gain / turn / np.exp(np.log(np.abs(gain)).mean()))
 
@@ -297,7 +297,8 @@ def _rank_one(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def _additive(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What a sum of a term by row and one by column leaves, and these terms less their mean."""
+    """Fit a sum of a term by row and one by column; return the residual and these terms less their
+    mean."""
     rows, columns = (_centred(values.mean(axis=axis)) for axis in (1, 0))
     return values - values.mean() - rows[:, None] - columns, rows, columns
 

@@ -1,5 +1,5 @@
-"""What a file of samples does not say of itself: the chirp, the frame, the order of the numbers and
-the array."""
+"""Properties of a recording that its file does not hold: the chirp, the frame, the order of the
+numbers and the array."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Elements(Node):
 
 
 class Description(Node):
-    """How a file of samples is to be read."""
+    """Format of a file of samples."""
 
     format: Format | None = None
     """Kind of file; by default what the file's name ends in says."""

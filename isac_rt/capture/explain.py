@@ -1,4 +1,4 @@
-"""How much of a measured cube the simulated one of the same scene explains, with and without each
+"""Share of a measured cube that the simulated one of the same scene explains, with and without each
 part of the board."""
 
 from __future__ import annotations

@@ -289,7 +289,7 @@ def _as_stated(meta: Path, info: dict[str, Any], d: Description) -> Description:
 
 
 def _is_finite(value: Any) -> bool:
-    """Whether a value of JSON is a number that a float holds."""
+    """Return whether a value of JSON is a number that a float holds."""
     try:
         return isinstance(value, int | float) and math.isfinite(value)
     except OverflowError:  # an integer of hundreds of digits

@@ -21,7 +21,8 @@ from isac_rt.receive.types import Detections, Reception
 
 
 def sense(capture: Capture, settings: Receivers) -> Reception:
-    """What the active terminal's receiver finds in a measured frame, with its map.
+    """Detect paths in a measured frame with the active terminal's receiver; return them with the
+    map.
 
     Images in the upper half of the range cells, where a board samples one of I and Q alone or both
     bands, are left out. Where every antenna sends one chirp only there is no velocity: what is

@@ -51,7 +51,7 @@ class Capture:
 
     @property
     def one_sided(self) -> bool:
-        """Whether the upper half of the range cells holds images."""
+        """Return whether the upper half of the range cells holds images."""
         return self.source.get("sampling") in ("real", "complex_2x")
 
     def channels(self) -> np.ndarray:

@@ -1,5 +1,5 @@
-"""What the command line writes: text, tables, and a bar while something takes long. Nothing of it
-is markup, so that "range [m]" keeps its unit."""
+"""Output of the command line: text, tables, and a bar for long work. Text is never read as markup,
+so that "range [m]" keeps its unit."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EVERY_S, SOON_S = 10.0, 1.0
 
 
 def out() -> Console:
-    """What a command answers."""
+    """Write a command's answer."""
     console = Console(markup=False, highlight=False, emoji=False)
     if not console.is_terminal:
         console.width = 140  # in a file or a pipe there is no edge to wrap at
@@ -30,7 +30,7 @@ def out() -> Console:
 
 
 def err() -> Console:
-    """What it says besides: progress and warnings."""
+    """Write progress and warnings."""
     return Console(stderr=True, markup=False, highlight=False, emoji=False)
 
 
@@ -144,8 +144,8 @@ class _Pace:
 
 
 class _Lines:
-    """What is being done, line by line: at once, at the end, and in between at least every
-    `EVERY_S`; steps that are logged less than `SOON_S` after a line wait for the next."""
+    """Progress as lines: at once, at the end, and in between at least every `EVERY_S`; steps that
+    are logged less than `SOON_S` after a line wait for the next."""
 
     def __init__(self, what: str, total: int | None = None) -> None:
         self._what, self._done, self._total, self._step = what, 0, total, ""

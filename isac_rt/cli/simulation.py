@@ -139,7 +139,7 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
 
 
 def _drawing() -> tuple[Callable[..., list[Path]], Callable[..., Path]]:
-    """What draws the figures and what writes the report, loaded at the first call."""
+    """Load the functions that draw figures and write the report, at the first call."""
     from isac_rt.views.figures import make_figures
     from isac_rt.views.report import write_report
 
@@ -147,12 +147,12 @@ def _drawing() -> tuple[Callable[..., list[Path]], Callable[..., Path]]:
 
 
 def _say_city(notes: Sequence[str]) -> None:
-    """What was assumed of the city and left out of its file."""
+    """Print what was assumed of the city and left out of its file."""
     say(*(f"city: {note}" for note in notes))
 
 
 def _say_coverage(seen: Mapping[str, Any]) -> None:
-    """What the radar can see, as of `isac_rt.simulation.coverage.Coverage`."""
+    """Print the coverage of the radar, from `isac_rt.simulation.coverage.Coverage`."""
     from isac_rt.views.tables import coverage_tables
 
     limits, words, outside = coverage_tables(seen)
@@ -254,8 +254,8 @@ def plan(
     as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
     overrides: Overrides = None,
 ) -> None:
-    """What a run will model, what it leaves out and why, and the estimated error of each; traces a
-    few frames only."""
+    """Show what a run will model, what it leaves out and why, and the estimated error of each;
+    traces a few frames only."""
     from isac_rt.scenario.file import load
 
     loaded = load(scenario, overrides or ())

@@ -170,8 +170,8 @@ def _ahead(formation: Formation) -> NDArray[np.float64]:
 
 
 def _is_good(corners: NDArray[np.float64], flights: Formation) -> bool:
-    """Whether flights meet no face, all UAVs see each other first and last, and a wall stands in
-    front of the first."""
+    """Return whether flights meet no face, all UAVs see each other first and last, and a wall
+    stands in front of the first."""
     ends = np.concatenate([flights.starts, flights.ends])
     reach = [ends.min(axis=0) - VIEW_M, ends.max(axis=0) + VIEW_M]
     near = corners[

@@ -162,7 +162,8 @@ def _quoted(text: str) -> str:
 
 
 def _is_far(city: CityMesh, place: Place) -> bool:
-    """Whether world coordinates are those of a plane about the middle, or far from their origin."""
+    """Return whether world coordinates are those of a plane about the middle, or far from their
+    origin."""
     return bool(place.plane) or float(np.abs(city.bounds() + city.origin).max()) > FAR_M
 
 

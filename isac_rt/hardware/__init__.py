@@ -1,2 +1,2 @@
-"""What a terminal's hardware does to the signal: oscillators, channels, converters. No paths and no
-receivers here: `isac_rt.signal.received` applies these models to the samples."""
+"""Models of a terminal's hardware: oscillators, channels, converters. No paths and no receivers
+here: `isac_rt.signal.received` applies these models to the samples."""

@@ -40,7 +40,7 @@ def watts(dbm: float) -> float:
 
 @dataclass(frozen=True)
 class Converter:
-    """What acts on the samples of each element, in this order.
+    """Effects on the samples of each element, in this order.
 
     Attributes
     ----------

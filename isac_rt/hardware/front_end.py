@@ -16,7 +16,7 @@ from isac_rt.hardware.sweep import Ramp, Response, ramp_of, response_of
 
 @dataclass(frozen=True)
 class FrontEnd:
-    """What a terminal's hardware does to what it sends and receives; None: a part that is ideal.
+    """Hardware between a terminal's signal and its antennas; None: a part that is ideal.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class FrontEnd:
 
     @property
     def ideal(self) -> bool:
-        """Whether all parts are."""
+        """True if all parts are ideal."""
         return not self.parts
 
     def only(self, part: str) -> FrontEnd:
@@ -77,7 +77,7 @@ class Ends:
 
     @property
     def ideal(self) -> bool:
-        """Whether the samples are those of `isac_rt.signal.if_signal.if_signal`."""
+        """True if the samples are those of `isac_rt.signal.if_signal.if_signal`."""
         return self.receiver.ideal and all(one.ideal for one in self.senders)
 
 

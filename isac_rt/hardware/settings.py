@@ -1,4 +1,4 @@
-"""What a scenario says about the front end of a terminal: how far its hardware is from ideal."""
+"""Settings of a terminal's front end: departures of its hardware from the ideal."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Oscillator(Node):
 
     @property
     def ideal(self) -> bool:
-        """Whether it has no noise."""
+        """True if it has no noise."""
         return not self.mask_dbc_hz
 
     def problems(self) -> Iterator[Problem]:
@@ -101,7 +101,7 @@ class Elements(Node):
 
     @property
     def ideal(self) -> bool:
-        """Whether all elements are as they should be."""
+        """True if all elements are ideal."""
         return self == Elements()
 
     def counts(self) -> Iterator[tuple[str, int]]:
@@ -135,12 +135,12 @@ class Response(Node):
 
     @property
     def ideal(self) -> bool:
-        """Whether it is 1 at all elements."""
+        """True if it is 1 at all elements."""
         return self == Response()
 
     @property
     def differs(self) -> bool:
-        """Whether elements have responses of their own."""
+        """True if elements have individual responses."""
         return bool(self.slope_std_db or self.slope_std_deg)
 
     def problems(self) -> Iterator[Problem]:
@@ -154,7 +154,7 @@ FARTHEST_HZ = 1e8
 
 
 class Ramp(Node):
-    """How far the chirp's frequency is from a straight line: the error of the beat grows with the
+    """Departure of the chirp's frequency from a straight line: the beat's error grows with the
     delay."""
 
     REMOVED: ClassVar[dict[str, str]] = {
@@ -171,7 +171,7 @@ class Ramp(Node):
 
     @property
     def ideal(self) -> bool:
-        """Whether the frequency is a straight line."""
+        """True if the frequency is a straight line."""
         return not (self.quadratic_hz or self.ripple_hz)
 
     def problems(self) -> Iterator[Problem]:
@@ -198,7 +198,7 @@ class Shifter(Node):
 
     @property
     def ideal(self) -> bool:
-        """Whether any phase can be sent as it is."""
+        """True if any phase can be sent as it is."""
         return self.bits is None
 
     def problems(self) -> Iterator[Problem]:
@@ -212,8 +212,7 @@ class Shifter(Node):
 
 
 class Converter(Node):
-    """What the receiver does behind its antennas: amplifier, mixer, converters, on signal and noise
-    alike."""
+    """Receiver behind its antennas: amplifier, mixer, converters, on signal and noise alike."""
 
     REMOVED: ClassVar[dict[str, str]] = {
         "headroom_db": "leave it out: the automatic gain leaves 12 dB; or full_scale_dbm fixes it"
@@ -241,7 +240,7 @@ class Converter(Node):
 
     @property
     def ideal(self) -> bool:
-        """Whether samples are kept as they come."""
+        """True if samples are kept unchanged."""
         return self == Converter()
 
     def applies(self, name: str) -> bool:
@@ -294,8 +293,8 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 class FrontEnd(Node):
-    """How far a terminal's hardware is from ideal. Each part is off by default and acts by
-    itself."""
+    """Departures of a terminal's hardware from the ideal. Each part is off by default and
+    independent of the others."""
 
     preset: Literal["ideal", "pll_good", "pll_poor", "awr1443", "awr2243_cascade"] = "ideal"
     """Settings by name, which the keys stated beside it override. `pll_good`, `pll_poor`: a locked
@@ -341,7 +340,7 @@ class FrontEnd(Node):
 
     @property
     def ideal(self) -> bool:
-        """Whether nothing departs from the ideal."""
+        """True if nothing departs from the ideal."""
         parts = (
             self.oscillator,
             self.transmit,

@@ -28,7 +28,7 @@ class Shifter:
     steps: np.ndarray
 
     def sent(self, antenna: int, code: np.ndarray) -> np.ndarray:
-        """What an antenna sends for phasors (...) of a code.
+        """Return the phasors that an antenna sends for phasors (...) of a code.
 
         Examples
         --------

@@ -1,4 +1,4 @@
-r"""What changes over a chirp: the complex gain of the front ends, and the chirp's own frequency.
+r"""Changes over a chirp: the complex gain of the front ends, and the chirp's own frequency.
 
 A chirp whose frequency is e(u) off a straight line has the phase :math:`\epsilon = 2\pi\int e`
 more. A wave of delay tau, data and all, then has in the IF
@@ -41,7 +41,7 @@ class Response:
 
     @property
     def common(self) -> bool:
-        """Whether all elements have the same."""
+        """True if all elements share one response."""
         return not self.slopes.any()
 
     def at(self, place: np.ndarray) -> np.ndarray:
@@ -163,7 +163,7 @@ _SHAPE = 6.0  # Kaiser's beta
 
 
 def read_at(shift: np.ndarray) -> tuple[int, np.ndarray]:
-    """How samples are read at other places, for a band of two thirds of the sampling rate about
+    """Interpolate samples at other instants, for a band of two thirds of the sampling rate about
     zero: Kaiser's window of `REACH` samples to each side.
 
     Parameters

@@ -17,7 +17,7 @@ from isac_rt.world.swarm import Swarm
 
 @dataclass(frozen=True)
 class Ground:
-    """What propagation models are made from.
+    """Inputs from which propagation models are made.
 
     Attributes
     ----------

@@ -133,7 +133,7 @@ class FreeSpace:
         return self._own_echoes(poses, tx)[self.strongest_target(poses, tx)] * self.antennas.gain
 
     def has_target(self, tx: str) -> bool:
-        """Whether there is another UAV whose cross-section is its own."""
+        """Return whether there is another UAV with a cross-section of its own."""
         return any(name != tx and uav.rcs.model != "relative" for name, uav in self.uavs.items())
 
     def strongest_target(self, poses: dict[str, Pose], tx: str) -> str:

@@ -1,4 +1,4 @@
-"""What a propagation model is: poses in, path sets out."""
+"""Protocol of a propagation model: poses in, path sets out."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Traced(NamedTuple):
 
 @dataclass(frozen=True)
 class Census:
-    """What a propagation model holds of the city's clutter; None for what it does not model.
+    """Amount of the city's clutter in a propagation model; None for what it does not model.
 
     Attributes
     ----------
@@ -39,12 +39,12 @@ class Census:
 
 
 class Propagation(Protocol):
-    """What a run needs of a propagation model."""
+    """Methods of a propagation model that a run calls."""
 
     def trace(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Traced:
         """Paths of every link at an instant [s]."""
         ...
 
     def census(self) -> Census:
-        """What the model holds, the same at all instants."""
+        """Return the size of the model, the same at all instants."""
         ...

@@ -14,7 +14,7 @@ from isac_rt.frame.link import Link
 
 
 class PathKind(IntEnum):
-    """What a path is; its label from the mesh to the detection it causes.
+    """Kind of a path; its label from the mesh to the detection it causes.
 
     Examples
     --------

@@ -1,5 +1,4 @@
-"""What a scenario says about the city, the paths in it, its clutter, and how near to the full model
-a run has to come."""
+"""Settings of the city, the paths in it, and its clutter."""
 
 from __future__ import annotations
 
@@ -13,7 +12,7 @@ from isac_rt.settings import Decibels, Loss, Node, Positive, Problem
 
 
 class Leakage(Node):
-    """What a terminal's receiver hears of its own transmitter on the same body."""
+    """Coupling of a terminal's transmitter into its own receiver."""
 
     REMOVED: ClassVar[dict[str, str]] = {"delay_s": "leave it out: it is 1e-9, 30 cm of way"}
 
@@ -26,7 +25,7 @@ class Leakage(Node):
 
 
 class Propagation(Node):
-    """Which paths there are between the terminals and by way of the targets."""
+    """Paths between the terminals and by way of the targets."""
 
     REMOVED: ClassVar[dict[str, str]] = {"specular": "max_bounces: 0 for no mirror reflections"}
 
@@ -55,7 +54,7 @@ class Propagation(Node):
 
 
 class Clutter(Node):
-    """What is received beside lines of sight, targets, ghosts and mirror images."""
+    """Echoes of the city besides lines of sight, targets, ghosts and mirror images."""
 
     REMOVED: ClassVar[dict[str, str]] = {
         "level_of": "leave it out: level_db is of the mean power; of the mean amplitude, add 1.05",

@@ -41,7 +41,7 @@ class PathStore:
         return Store(self.folder, SUFFIX, self.limit)
 
     def get(self, key: str) -> tuple[Traced, Census] | None:
-        """What was traced for a key, and by what; None where it is not (or no longer) here."""
+        """Return the paths traced for a key, and by what; None where it is not here."""
         data = self._store.get(key)
         try:
             return None if data is None else _unpack(data)

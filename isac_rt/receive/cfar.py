@@ -290,7 +290,7 @@ def without_sidelobes(
     floor: float,
     margin: float = LOBE_MARGIN,
 ) -> np.ndarray:
-    """Which peaks (strongest first) are more than what a stronger one leaves around it.
+    """Mark the peaks (strongest first) that are more than the sidelobes of a stronger one.
 
     Parameters
     ----------

@@ -72,7 +72,7 @@ def detector_of(settings: Receivers) -> Detector:
 
 
 def refiner_of(settings: Receivers) -> Refiner | None:
-    """What makes the estimates better with all paths at once."""
+    """Return the function that refines the estimates with all paths at once."""
     return REFINERS[settings.refinement]
 
 

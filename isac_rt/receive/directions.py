@@ -62,7 +62,7 @@ class Lines:
 
 @dataclass(frozen=True)
 class Search:
-    """How a set of channels is searched for directions.
+    """Grid and refinement of a search for directions over a set of channels.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ def turned(phases: np.ndarray) -> np.ndarray:
 
 
 def _sizes(values: np.ndarray) -> np.ndarray:
-    """Of each value how many are equal to it."""
+    """Count for each value how many are equal to it."""
     return (np.abs(values[:, None] - values) < 1e-9).sum(axis=1)
 
 

@@ -176,8 +176,8 @@ class LocalSpectra:
 
 
 class _Sent(NamedTuple):
-    """Of each chirp its weight, time [s] and antenna, the first two filled up to a multiple of
-    sixteen, and the number of antennas; in every separate group they count anew."""
+    """Weight, time [s] and antenna of each chirp, the first two filled up to a multiple of sixteen,
+    and the number of antennas; separate groups count theirs anew."""
 
     weight: np.ndarray
     time: np.ndarray
@@ -205,7 +205,7 @@ def _room(sent: _Sent, num_rx: int, rows: int) -> Chirps:
 
 
 def _axis(waveform: Waveform) -> WindowAxis:
-    """Of all rows."""
+    """Return the axis of all rows."""
     w = waveform
     share = w.window_length / w.num_samples
     window = w.window_middle, w.sampled_duration, w.window_length, share
@@ -327,7 +327,7 @@ def _newton(powers: np.ndarray, step: float, mixed: float) -> tuple[float, float
 
 @dataclass(frozen=True)
 class Estimator:
-    """How a peak of the map becomes an estimate: off the grid, or `on_grid` as the centre of its
+    """Estimator of a path at a peak of the map: off the grid, or `on_grid` as the centre of its
     cell and the nearest of the directions, eight to a beam."""
 
     on_grid: bool = False
@@ -349,7 +349,7 @@ class Estimator:
         *,
         separate: bool = False,
     ) -> list[Estimate]:
-        """Those of all peaks (Q,) in spectra; `separate` as in `LocalSpectra`."""
+        """Return the local spectra at all peaks (Q,); `separate` as in `LocalSpectra`."""
         spectra = np.ascontiguousarray(spectra)
         return [
             self.at(LocalSpectra(spectra, known, row, separate=separate), power, row, column)

@@ -49,7 +49,7 @@ class Known:
 
     @classmethod
     def of(cls, cube: IFCube, payload: Payload, antennas: Antennas, passes: int) -> Known:
-        """What a receiver of a frame knows to which the payload is known."""
+        """Return the knowledge of a receiver to which the payload of a frame is known."""
         sent = payload.delay_symbols, payload.phases
         return cls(cube.waveform, cube.schedule, *sent, antennas, passes)
 
@@ -57,7 +57,7 @@ class Known:
     def unmodulated(
         cls, waveform: Waveform, schedule: Schedule, antennas: Antennas, passes: int
     ) -> Known:
-        """What is known of a frame without data."""
+        """Return the knowledge of a frame without data."""
         pilot = unmodulated(waveform)
         return cls(waveform, schedule, pilot.delay_symbols, pilot.phases, antennas, passes)
 
@@ -72,7 +72,7 @@ class Known:
         return spectra * codes.conj().astype(np.complex64)[:, None, None], known
 
     def alike(self, other: Known) -> bool:
-        """Whether both know the same of one frame."""
+        """Return whether both hold the same knowledge of one frame."""
         same = self.antennas == other.antennas and self.passes == other.passes
         same = same and np.array_equal(self.delay_symbols, other.delay_symbols)
         return same and np.array_equal(self.phases, other.phases)
@@ -97,7 +97,7 @@ class Known:
 
     @cached_property
     def full(self) -> bool:
-        """Whether the groups together sample every antenna in every slot."""
+        """True if the groups together sample every antenna in every slot."""
         num_tx = self.waveform.num_tx
         return len(self.schedule) == num_tx and is_latin(self.schedule, num_tx)
 
@@ -123,7 +123,7 @@ class Known:
 
     @cached_property
     def sent_by(self) -> list[np.ndarray]:
-        """Of each transmit antenna the chirps that it sends, (M, P) bool."""
+        """Mark the chirps that each transmit antenna sends, (M, P) bool."""
         return [self.schedule == tx for tx in range(self.waveform.num_tx)]
 
     @cached_property

@@ -123,7 +123,7 @@ class LatinUnion:
         return known.mapped(spectra, lambda: power_map(spectra, known))
 
     def keep(self, above: np.ndarray, levels: Levels, known: Known) -> np.ndarray:
-        """Which of the cells `above` the threshold may be peaks."""
+        """Mark the cells `above` the threshold that may be peaks."""
         return above
 
 

@@ -37,8 +37,8 @@ def recovery_limit(num_samples: int, num_chirps: int) -> int:
 def _sparse_samples(
     spectra: np.ndarray, rows: np.ndarray, known: Known
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Of each group and transmit antenna its samples of some rows (L_rx, rows, S) and their slots
-    (S,)."""
+    """Return, per group and transmit antenna, the samples of some rows (L_rx, rows, S) and their
+    slots (S,)."""
     for m in range(len(spectra)):
         for sent in known.sent_by:
             chosen = np.flatnonzero(sent[m])
@@ -46,8 +46,8 @@ def _sparse_samples(
 
 
 def sparse_enough(spectra: np.ndarray, rows: np.ndarray, noise: float, known: Known) -> bool:
-    """Whether the occupied range rows are sparse enough in Doppler for random sampling (scheme
-    (d)).
+    """Return whether the occupied range rows are sparse enough in Doppler for random sampling
+    (scheme (d)).
 
     The paper falls back to scheme (c) "when the scene is not sparse" and gives no rule. Here: in a
     majority of the occupied rows, weighted by power over the noise, as many atoms as the sampling
@@ -142,7 +142,7 @@ class Pursued(NamedTuple):
 
 
 def pursued(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int) -> Pursued:
-    """What `omp` finds; parameters likewise."""
+    """Return the support that `omp` finds; same parameters."""
     analysis, gram = _dictionary(tuple(chosen.tolist()), num_chirps)
     first = np.asarray(vectors, np.complex64) @ analysis
     support = np.empty((len(vectors), sparsity), np.int64)

@@ -166,7 +166,7 @@ class PassiveReceiver:
         return _decoded(reception, symbols)
 
     def peaks(self, cube: IFCube, time: float, modulated: bool) -> Peaks:
-        """What is kept of a frame that could not be read, `time` its middle [s]."""
+        """Return the peaks kept of a frame that could not be read, `time` its middle [s]."""
         mine = cube if self.groups is None else cube.of_groups(self.groups)
         return find_peaks(mine, time, modulated)
 
@@ -188,7 +188,8 @@ class PassiveReceiver:
         return decide_phases(moments, path, self.reader.order)
 
     def _believed(self, symbols: Symbols, waveform: Waveform) -> bool:
-        """Whether the decisions look neither like noise nor like a path that moves otherwise."""
+        """Return whether the decisions look neither like noise nor like a path with another
+        velocity."""
         least = confidence_threshold(symbols.looks, symbol_cells(waveform).size, symbols.raw.size)
         confident = np.median(symbols.delay_confidence) >= least
         return bool(confident) and moves_as_predicted(symbols, self.reader.order)
@@ -200,7 +201,7 @@ class PassiveReceiver:
         prediction: Prediction,
         hints: Hints,
     ) -> tuple[Sensed, Detections, Estimate | None]:
-        """What a frame shows once its symbols are taken out, with the reference put first."""
+        """Sense in a frame whose symbols are removed, with the reference put first."""
         known = moments.known
         found = self.detector.sense(spectra, known, hints)
         detections, reference = self._at_prediction(spectra, known, found, prediction)
@@ -214,7 +215,7 @@ class PassiveReceiver:
         detections: Detections,
         reference: Estimate | None,
     ) -> tuple[Look, ...]:
-        """What the reference shows of the channels, where that is asked for."""
+        """Return the channels as the reference shows them, where that is asked for."""
         if reference is None or self.settings.self_calibration == "none":
             return ()
         return look_at(spectra, known, [reference], detections.snr[detections.is_reference])
@@ -285,7 +286,7 @@ class PassiveReceiver:
         *,
         maps: bool,
     ) -> Reception:
-        """What was found, refined, without the symbols."""
+        """Return the refined detections, without the symbols."""
         picture = make_maps(found.power, cube, self.settings, 1) if maps else None
         out = Reception.undecoded(cube.waveform, detections, picture, found.sparse)
         if reference is not None:

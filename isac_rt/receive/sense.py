@@ -59,7 +59,7 @@ class Sensed:
 
 
 class Detector(Protocol):
-    """What finds paths in cleaned spectra (M, L_rx, rows, P)."""
+    """Protocol of a detector: it finds paths in cleaned spectra (M, L_rx, rows, P)."""
 
     def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
         """Return what a frame shows."""
@@ -82,7 +82,7 @@ class Cfar:
     doppler: LatinUnion | None = None
 
     def way(self, known: Known) -> LatinUnion:
-        """How the map of a frame is made."""
+        """Return how the map of a frame is made."""
         return self.doppler or doppler_of(known)
 
     def rule(self, known: Known) -> CfarRule:
@@ -143,7 +143,7 @@ def window_gain(known: Known) -> float:
 def look_at(
     spectra: np.ndarray, known: Known, estimates: Sequence[Estimate], snr: np.ndarray
 ) -> tuple[Look, ...]:
-    """What the `MOST_LOOKS` strongest of some paths show of the channels, strongest first."""
+    """Return the channels as the `MOST_LOOKS` strongest of the paths show them."""
     out = []
     for i in np.argsort(snr)[::-1][:MOST_LOOKS]:
         delay, rate = estimates[i].delay, estimates[i].delay_rate

@@ -1,4 +1,4 @@
-"""What a scenario says about receivers and trackers."""
+"""Settings of receivers and trackers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COUNTS_WITH = {
 
 
 class Receivers(Node):
-    """How terminals detect targets and decode data."""
+    """Detection of targets and decoding of data at the terminals."""
 
     REMOVED: ClassVar[dict[str, str]] = {
         "active_input": "leave it out: every receiver starts from samples",
@@ -136,23 +136,23 @@ class Receivers(Node):
 
     @property
     def false_alarm_rates(self) -> tuple[float, float]:
-        """Of a detection, and of one that may start a track."""
+        """False alarm rates of a detection, and of one that may start a track."""
         return self.update_false_alarm_rate or self.false_alarm_rate, self.false_alarm_rate
 
     @property
     def gate_rate(self) -> float:
-        """Of a detection in the gate of an expected UAV; that of any other cell where the gate has
-        none of its own."""
+        """False alarm rate of a detection in the gate of an expected UAV; that of any other cell
+        where the gate has none of its own."""
         return self.gate_false_alarm_rate or self.false_alarm_rates[0]
 
     @property
     def needs_mesh(self) -> bool:
-        """Whether the detector predicts clutter from a city's mesh."""
+        """True if the detector predicts clutter from a city's mesh."""
         return self.clutter_detector == "angle_doppler"
 
     def looks_by_beam(self, own: bool) -> bool:
-        """Whether the antennas are added in phase at an active terminal (`own`) or at a passive
-        one, so that paths far below the noise of one antenna are seen."""
+        """Return whether the antennas are added in phase at an active terminal (`own`) or at a
+        passive one, so that paths far below the noise of one antenna are seen."""
         if self.refinement == "joint":
             return True
         if own:

@@ -1,5 +1,4 @@
-"""What a receiver is given besides the samples, and what it hands on. Nothing here comes from the
-truth."""
+"""Inputs of a receiver besides the samples, and its outputs. Nothing here comes from the truth."""
 
 from __future__ import annotations
 
@@ -13,8 +12,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """What tracking expects of the paths of one frame, in measurement space, at the middle of the
-    frame.
+    """Predicted paths of one frame, in measurement space, at the middle of the frame.
 
     One row per expected path; row 0 of a PT is its line of sight.
 
@@ -152,7 +150,7 @@ class Maps:
 
 @dataclass(frozen=True)
 class Look:
-    """What one strong path shows of the channels that heard it.
+    """Channels as one strong path shows them.
 
     Attributes
     ----------
@@ -188,7 +186,7 @@ class Neighbours:
 
 @dataclass(frozen=True, kw_only=True)
 class Reception:
-    """What one terminal made of one frame.
+    """Output of one terminal's receiver for one frame.
 
     Attributes
     ----------
@@ -357,7 +355,7 @@ class ExpectedClutter:
 
 @dataclass(frozen=True)
 class Correction:
-    """What a frame says of the terminal's own mistakes.
+    """Estimate of the terminal's own errors from a frame.
 
     Attributes
     ----------
@@ -384,7 +382,7 @@ class Correction:
 
 @dataclass(frozen=True)
 class Hints:
-    """What a terminal expects of a frame before it looks at the samples.
+    """Knowledge of a terminal about a frame before it processes the samples.
 
     Attributes
     ----------

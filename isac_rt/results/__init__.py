@@ -1,1 +1,1 @@
-"""What a run leaves: records and scores of every frame, one dataset, one summary, files."""
+"""Results of a run: records and scores of every frame, one dataset, one summary, files."""

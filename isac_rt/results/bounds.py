@@ -38,7 +38,8 @@ class CramerRao:
 
     @classmethod
     def of(cls, waveform: Waveform, antennas: Antennas, passes: int) -> CramerRao:
-        """Of a frame; `passes` 2 for an echo in one-way range, 1 for a path length."""
+        """Return the bounds of a frame; `passes` 2 for an echo in one-way range, 1 for a path
+        length."""
         w, carrier = waveform, float(waveform.carrier())
         fast = w.sample_interval * np.sqrt((w.num_samples**2 - 1) / 12)
         slow = w.slot_duration * np.sqrt((w.num_chirps**2 - 1) / 12)
@@ -66,8 +67,8 @@ class CramerRao:
 
 
 def error_quantile(deviations: np.ndarray, share: float) -> float:
-    """What a share of the magnitudes of errors stays under, each error normal with a standard
-    deviation of its own.
+    """Return the level that a share of the magnitudes of errors stays under, each error normal with
+    a standard deviation of its own.
 
     Examples
     --------

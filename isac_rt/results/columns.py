@@ -1,5 +1,5 @@
-"""What is recorded of every frame, declared once: each column's name, type, unit, meaning, source
-and dimensions. Rows of tables and the dataset are made from these."""
+"""Columns recorded of every frame, declared once: each one's name, type, unit, meaning, source and
+dimensions. Rows of tables and the dataset are made from these."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ MEASURES = {
 
 
 class Column(NamedTuple):
-    """How an array of the dataset is made: from which attribute (or by which function) of a record
-    or a `PathSet`, over which dimensions beside frame and observer (or beside a
-    row), and with which value where an observer did not receive (or a row is shorter)."""
+    """Definition of an array of the dataset: from which attribute (or by which function) of a
+    record or a `PathSet`, over which dimensions besides frame and observer (or besides a row), and
+    with which value where an observer did not receive (or a row is shorter)."""
 
     dtype: type
     units: str

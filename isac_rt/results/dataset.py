@@ -114,8 +114,8 @@ def stacked(parts: Sequence[np.ndarray], column: Column) -> np.ndarray:
 
 
 def row_of(record: FrameRecord) -> Row:
-    """What is kept of a frame: numbers and arrays only. The paths themselves and the maps are kept
-    of snapshots alone."""
+    """Return the kept data of a frame: numbers and arrays only. The paths themselves and the maps
+    are kept of snapshots alone."""
     uavs = list(record.poses)
 
     def rows(kind: str, of: Mapping[Any, Any]) -> dict[str, np.ndarray]:
@@ -253,7 +253,7 @@ def _put_ragged(
 def _put_places(
     put: Callable[..., None], prefix: str, dim: str, along: str, places: np.ndarray
 ) -> None:
-    """Of which frame, and which of another dimension, rows are (K, 2)."""
+    """Put the frame, and the index along another dimension, of each row (K, 2)."""
     for k, name in enumerate(("frame", along)):
         meaning = f"position along the dimension {name}"
         put(f"{prefix}_{name}", [dim], places[:, k].astype(np.int32), DIMENSIONLESS, meaning)

@@ -48,7 +48,7 @@ class ResultsError(UserError):
 
 
 class _Block(BaseModel):
-    """What is said of a terminal before anything else."""
+    """First lines about a terminal."""
 
     hit_rate: float | None
     ser_delay: float | None

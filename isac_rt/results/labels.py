@@ -1,4 +1,4 @@
-"""Which path caused a detection."""
+"""Labels of detections: the path that caused each."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ more than noise."""
 
 
 class Explanation(NamedTuple):
-    """What caused each of Q detections; -1 where nothing stands out of the noise (a false alarm).
+    """Causes of Q detections; -1 where nothing stands out of the noise (a false alarm).
 
     kind : (Q,) int8 `PathKind`
     target : (Q,) int16 index into the set's target names, -1 also where no UAV is involved
@@ -124,7 +124,7 @@ def explain(
     cell_gain: float,
     aim: Aim | None = None,
 ) -> Explanation:
-    """Which path caused each detection: the one with the most power at its place.
+    """Return the path that caused each detection: the one with the most power at its place.
 
     A path counts with all its power within one cell in range and in Doppler, and beyond with what
     its Hann-windowed sidelobes hold at most. The diffuse paths within a cell count together, as the

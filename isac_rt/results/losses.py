@@ -32,7 +32,7 @@ HANN_LOSS = 1.5
 
 
 class Loss(IntEnum):
-    """What became of a UAV in view in one frame; of several that hold, the first."""
+    """Outcome of a UAV in view in one frame; of several that hold, the first."""
 
     FOUND = 0  # by its own path, within one resolution on all four axes
     TOO_WEAK = 1  # for a matched filter that is coherent over samples, chirps and antennas
@@ -53,7 +53,7 @@ LOSSES = tuple(loss.name.lower() for loss in Loss)
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """How a frame of a link shows a path of unit power (|gain|^2).
+    """Response of a link's frame to a path of unit power (|gain|^2).
 
     Attributes
     ----------
@@ -80,8 +80,8 @@ class Sensitivity:
         groups: int,
         own: bool = False,
     ) -> Sensitivity:
-        """What the link budget says of a frame of which the receiver reads so many groups; `own`:
-        it hears its own chirps."""
+        """Return the sensitivity by the link budget for a frame and the number of groups that the
+        receiver reads; `own`: it receives its own chirps."""
         groups = groups * sent.num_streams
         w, chirps = waveform, groups * waveform.num_chirps
         sample = sent.amplitude**2 / noise_power
@@ -99,8 +99,8 @@ class Sensitivity:
         )
 
     def detection_probability(self, snr: float, background: float = 0.0) -> float:
-        """Of a steady path with this SNR in its cell, in noise and a background of so many times
-        its power in the cells around."""
+        """Return the detection probability of a steady path with this SNR in its cell, in noise and
+        a background of `background` times its power in the cells around."""
         degrees, threshold = 2 * self.rule.looks, self.rule.threshold * (1 + background)
         return float(1 - chndtr(degrees * threshold, degrees, degrees * snr))
 
@@ -125,7 +125,7 @@ def single_look(snr: float, rate: float) -> float:
 
 @dataclass(frozen=True)
 class Chance:
-    """What one UAV's own path amounts to in a frame, over the noise.
+    """Level of one UAV's own path in a frame, over the noise.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class Chance:
     def of(
         cls, own: int, paths: PathSet, places: Places, waveform: Waveform, sees: Sensitivity
     ) -> Chance:
-        """Of path number `own`."""
+        """Return the chance of path number `own`."""
         w, power = waveform, paths.power
         half = w.frame_duration / 2
         life = max(min(paths.end[own], half) - max(paths.begin[own], -half), 0.0) / (2 * half)
@@ -208,7 +208,7 @@ def _around(
 def cause_of(
     hit: bool, own: bool, beside: np.ndarray, chance: Chance, sees: Sensitivity, read: bool
 ) -> Loss:
-    """What became of a UAV in view in one frame.
+    """Return the outcome of a UAV in view in one frame.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ class Truth(NamedTuple):
 
 
 def truth_of(observer: Pose, uav: Pose, at: Pose | None = None) -> Truth:
-    """What `observer` ought to measure of `uav`.
+    """Return what `observer` ought to measure of `uav`.
 
     Without `at` the one-way range and its rate: every target of an AT, and the AT itself at a PT.
     With `at` the bistatic path length AT - UAV - observer and its rate. The direction is that of
@@ -168,8 +168,8 @@ def binomial_interval(
 
 
 def within_view(antennas: Antennas, own: Pose, active: Pose, body: Pose) -> bool:
-    """Whether a body is in the field of view of the receiver and, unless it is the transmitter
-    itself, of the transmitter."""
+    """Return whether a target is in the field of view of the receiver and, unless it is the
+    transmitter itself, of the transmitter."""
     ends = [(own, body)]
     if body is active:
         ends.append((active, own))

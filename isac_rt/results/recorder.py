@@ -64,7 +64,7 @@ class Results:
 
 @dataclass(frozen=True)
 class Figures:
-    """What a summary needs beside the frames.
+    """Inputs of a summary besides the frames.
 
     Attributes
     ----------
@@ -247,7 +247,7 @@ class Recorder:
         return self.tables["observer"][self.timetable.labels[link]].whole()
 
     def _sensing(self, link: Link, heard: np.ndarray) -> Sensing:
-        """What a link's receiver saw, of its rows."""
+        """Summarise the sensing of a link's receiver from its rows."""
         label = self.timetable.labels[link]
         frames, tracks = self.tables["observer"][label].frames(), self.tables["track"][label]
         return Sensing.of(heard, tracks.whole(), np.searchsorted(frames, tracks.frames()))
@@ -264,14 +264,13 @@ class Recorder:
 
 
 def _symbols(link: Link, heard: np.ndarray) -> SymbolCount | None:
-    """What was sent over a link and became of it, of its receiver's rows; None for a terminal's own
-    echoes."""
+    """Summarise the symbols of a link by its receiver's rows; None for own echoes."""
     return None if link.own else SymbolCount(*heard["symbols"].sum(axis=0).tolist())
 
 
 def kept_of_paths(use: Columns) -> dict[str, Any]:
-    """What was kept and left out of a link's paths over a run: paths per frame, and the largest
-    bounds of all frames.
+    """Return how much of a link's paths was kept and left out over a run: paths per frame, and the
+    largest bounds of all frames.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is recorded of every frame."""
+"""Records of every frame."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class TrackTable:
 
 @dataclass(frozen=True, kw_only=True)
 class ObserverRecord:
-    """What one link's receiving terminal had and made of one frame.
+    """Inputs and outputs of one link's receiving terminal in one frame.
 
     Attributes
     ----------
@@ -139,7 +139,7 @@ class ObserverRecord:
 
 @dataclass(frozen=True)
 class LateRecord:
-    """What became of a link's earlier frame once its data were read; names as in `ObserverRecord`.
+    """Results of a link's earlier frame once its data were read; names as in `ObserverRecord`.
 
     Attributes
     ----------
@@ -207,7 +207,7 @@ class PictureRecord:
 
 @dataclass(frozen=True)
 class Use:
-    """What was kept of the paths of one link in one frame, and the bounds of the rest.
+    """Share of one link's paths that was kept in one frame, and the bounds of the rest.
 
     Attributes
     ----------

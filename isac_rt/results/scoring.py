@@ -45,7 +45,7 @@ MISREAD = 0.5
 
 @dataclass(frozen=True)
 class Heard:
-    """What a terminal made of one frame: reception, tracks and the state it is in then
+    """Outcome of one frame at a terminal: reception, tracks and the state it is in then
     (`TerminalState`), and the earlier frames that it made readable."""
 
     reception: Reception
@@ -56,8 +56,8 @@ class Heard:
 
 @dataclass
 class Remembered:
-    """What is remembered of a link's tracks: by number kind, UAV and path's owner of the detection
-    that fed each last, and by UAV the track that followed it last."""
+    """Memory of a link's tracks: by number kind, UAV and path's owner of the detection that fed
+    each last, and by UAV the track that followed it last."""
 
     labels: dict[int, list[int]] = field(default_factory=dict)
     followed: dict[int, int] = field(default_factory=dict)
@@ -154,7 +154,7 @@ class Scorer(Stateful):
         )
 
     def late(self, frame: int, heard: Heard) -> list[LateRecord]:
-        """What became of earlier frames that frame number `frame` made readable."""
+        """Return the records of earlier frames that frame number `frame` made readable."""
         timetable, tx = self._timetable, self.link.tx
         records = []
         for one in heard.late:
@@ -275,7 +275,7 @@ class Scorer(Stateful):
         return tracks.is_reference | (np.append(friends, False)[uav])
 
     def _chances(self, view: _View, paths: PathSet, sees: Sensitivity) -> dict[int, Chance]:
-        """What the strongest straight path of each UAV seen amounts to."""
+        """Return the detection chance of the strongest straight path of each UAV seen."""
         w, out = self._timetable.waveform, {}
         places = Places.of(paths, w, self._passes)
         for i in view.seen:
@@ -301,7 +301,7 @@ class Scorer(Stateful):
 
 @dataclass(frozen=True)
 class _View:
-    """What a frame's receiver could see.
+    """Field of view of a frame's receiver.
 
     Attributes
     ----------

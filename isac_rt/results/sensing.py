@@ -1,4 +1,4 @@
-"""What a terminal's detections and tracks were worth over a run: rates, errors, GOSPA, causes."""
+"""Sensing of a terminal over a run: rates, errors, GOSPA, causes of losses."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class Sensing:
             return np.stack([values[f"{of}_{part}"] for part in PARTS], axis=-1)
 
         def counted(what: np.ndarray, of: np.ndarray, most: int) -> np.ndarray:
-            """How many of some tracks are of each number under `most`, frame by frame."""
+            """Count the tracks of each number under `most`, frame by frame."""
             out = np.zeros((count, most), int)
             np.add.at(out, (frame[of], what[of]), 1)
             return out
@@ -163,7 +163,7 @@ class Sensing:
         }
 
     def targets(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
-        """What became of each UAV, by its name."""
+        """Summarise each UAV, by its name."""
         return {name: self._target(i) for i, name in enumerate(names)}
 
     def _target(self, i: int) -> dict[str, Any]:

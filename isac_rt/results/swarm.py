@@ -72,7 +72,7 @@ class View:
 
 @dataclass
 class Remembered:
-    """Which UAVs (U,) each link saw last, and the UAV that fed each track last, -1: none."""
+    """UAVs (U,) that each link saw last, and the UAV that fed each track last, -1: none."""
 
     seen: dict[Link, np.ndarray] = field(default_factory=dict)
     fed: dict[Key, int] = field(default_factory=dict)

@@ -1,2 +1,2 @@
-"""What a terminal makes of its receiver's detections: tracks, predictions, its own view of the
+"""Tracking: from a receiver's detections to tracks, predictions, the terminal's own view of the
 mesh, ghosts."""

@@ -31,7 +31,7 @@ from isac_rt.world.swarm import Pose, Swarm
 
 @dataclass(frozen=True)
 class Mistakes:
-    """How wrong a terminal is about itself and the mesh; all zero by default.
+    """Errors of a terminal about itself and the mesh; all zero by default.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class MeshExpectation:
     def clutter(
         self, name: str, pose: Pose, time: float, amplitude: float, mistakes: Mistakes | None = None
     ) -> ExpectedClutter:
-        """What the terminal's own link returns at a time, from where it believes to be.
+        """Return the clutter of the terminal's own link at a time, from where it believes to be.
 
         Parameters
         ----------
@@ -121,7 +121,7 @@ class MeshExpectation:
         )
 
     def _errors(self, wrong: Mistakes) -> np.ndarray | None:
-        """Of each face along its normal [m]; None where the mesh is right."""
+        """Return the error of each face along its normal [m]; None where the mesh is right."""
         if not wrong.mesh_std:
             return None
         drawn = generator(wrong.seed, "mesh error").standard_normal(self._city.num_faces)
@@ -135,7 +135,7 @@ class MeshExpectation:
         own: Pose,
         mistakes: Mistakes | None = None,
     ) -> ExpectedClutter:
-        """What a passive terminal hears of the mesh, by one bounce and by way of mirrors.
+        """Return the mesh's clutter at a passive terminal, by one bounce and by way of mirrors.
 
         Parameters
         ----------
@@ -204,8 +204,8 @@ class MeshExpectation:
 
 
 class _Way(NamedTuple):
-    """What K scatterers on faces (K,) do, along which unit vectors (K, 3) both ways meet them, and
-    by how much the ways are longer than thought as a mirror is in error [m]."""
+    """Paths over K scatterers on faces (K,): unit vectors (K, 3) at which both segments meet them,
+    and the error of their length where a mirror is in error [m]."""
 
     seen: Seen
     face: np.ndarray
@@ -215,7 +215,7 @@ class _Way(NamedTuple):
 
 
 class ClutterExpectation(Protocol):
-    """What simulate needs of a terminal's copy of the mesh."""
+    """Clutter by a terminal's copy of the mesh, as simulate needs it."""
 
     def clutter(
         self, name: str, pose: Pose, time: float, amplitude: float, mistakes: Mistakes | None = None

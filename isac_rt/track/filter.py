@@ -43,9 +43,9 @@ class Gaussian(NamedTuple):
 
 
 class Ambiguity(NamedTuple):
-    """What a detection leaves open: the Doppler tells velocities a `period` [m/s] apart from each
-    other no more. The beat is of range and of Doppler, so that a detection whose velocity was read
-    one period too high was read too short by `shift` [m]."""
+    """Ambiguity of a detection: the Doppler does not distinguish velocities a `period` [m/s] apart.
+    The beat depends on range and Doppler, so a detection whose velocity was read one period too
+    high was read too short by `shift` [m]."""
 
     period: float = np.inf
     shift: float = 0.0
@@ -70,7 +70,8 @@ def _unit(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def measure(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None) -> np.ndarray:
-    r"""What `own` measures of a body: range, its rate and the direction cosines u_x and u_z.
+    r"""Return the measurement by `own` of a target: range, range rate and the direction cosines u_x
+    and u_z.
 
     One-way form (an echo's range at the AT, the line of sight at a PT):
     :math:`r = |x-p|,\ \dot r = e\cdot(v-v_p),\ u = R^T e` with :math:`e = (x-p)/r`. Bistatic form:
@@ -273,8 +274,8 @@ def expected(
 def reported(
     states: Sequence[Gaussian], own: Pose, transmitter: Gaussian | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What `measure` says of bodies (K, 4), and its standard deviations (K, 4) by their covariances
-    and, bistatic, the transmitter's."""
+    """Return the measurements of reported targets (K, 4), and their standard deviations (K, 4) by
+    their covariances and, bistatic, the transmitter's."""
     if not states:
         return np.zeros((0, 4)), np.zeros((0, 4))
     means, covariances = (np.array(of) for of in zip(*states, strict=True))

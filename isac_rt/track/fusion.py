@@ -74,9 +74,8 @@ class Name(NamedTuple):
 
 
 class Told(NamedTuple):
-    """What a terminal tells of a body, in world axes: its position and velocity (6,), (6, 6)
-    without the errors of who tells, and (6, `ERRORS`) what these errors, one deviation each, do to
-    it."""
+    """Reported target in world axes: its position and velocity (6,), covariance (6, 6) without the
+    reporter's errors, and (6, `ERRORS`) the effect of these errors, one deviation each."""
 
     state: Gaussian
     lever: np.ndarray
@@ -95,7 +94,7 @@ class Told(NamedTuple):
 
 @dataclass(frozen=True)
 class Report:
-    """What a terminal says of one of its tracks.
+    """Report of a terminal about one of its tracks.
 
     Attributes
     ----------
@@ -198,9 +197,9 @@ def in_world(
 def _levers(
     mean: np.ndarray, baseline: np.ndarray, clock_std: float, cell: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What the line of sight does to a track (6,) and what its terminal's errors do, (6, `ERRORS`);
-    `baseline` (3,) is to a passive terminal's transmitter, (0,) where the track does not depend on
-    it."""
+    """Return the effect of the line of sight on a track (6,) and of its terminal's errors, (6,
+    `ERRORS`); `baseline` (3,) is to a passive terminal's transmitter, (0,) where the track does not
+    depend on it."""
     lever, pulled = np.zeros((SIZE, ERRORS)), np.zeros(SIZE)
     lever[:3, :3], lever[3:, 3:6] = POSE_STD[0] * np.eye(3), POSE_STD[1] * np.eye(3)
     lever[:3, 6:9], lever[3:, 6:9] = (
@@ -217,7 +216,7 @@ def _norm(x: np.ndarray) -> float:
 
 
 def _by_length(offset: np.ndarray, baseline: np.ndarray, masked: float) -> np.ndarray:
-    """What a metre more of path length does to the place of a passive terminal's body (3,).
+    """Return the shift of a passive terminal's target (3,) per metre of path length.
 
     It moves along its direction. Zero if the way is more than `masked` [m] longer than the line of
     sight, and at an active terminal.
@@ -235,8 +234,8 @@ def _by_length(offset: np.ndarray, baseline: np.ndarray, masked: float) -> np.nd
 
 
 def _by_clock(offset: np.ndarray, baseline: np.ndarray) -> np.ndarray:
-    """How far a body moves for each metre that a terminal's clock adds to its ranges (3,): along
-    its direction, by its path length and its reference's, which are both too long."""
+    """Return the shift of a target (3,) for each metre that a terminal's clock adds to its ranges:
+    along its direction, by its path length and its reference's, which are both too long."""
     rho = _norm(offset)
     u = offset / rho
     if not baseline.size:
@@ -472,8 +471,8 @@ class _Body:
 
 @dataclass
 class Picture(Stateful):
-    """What a listener makes of all tracks that it knows: from frame to frame it remembers which of
-    them are one body, and its name."""
+    """Fused tracks of a listener over all tracks that it knows, with memory of which of them are
+    one target, and its name."""
 
     bodies: list[_Body] = field(default_factory=list)
 

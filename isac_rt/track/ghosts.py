@@ -1,5 +1,5 @@
-"""Which tracks of a terminal are ghosts, by geometry: the terminal knows its own pose and the
-city's mesh, and nothing of the truth.
+"""Ghost tracks by geometry: the terminal knows its own pose and the city's mesh, and nothing of the
+truth.
 
 A wall shows each UAV again, as a mirror does. Two questions are asked of a track, and either is
 enough to make it suspect:
@@ -97,7 +97,7 @@ class Ghosts(TrackRule):
 
 @dataclass(frozen=True)
 class Leeway:
-    """What a detection leaves open of a path.
+    """Uncertainty of a path that a detection leaves.
 
     Attributes
     ----------
@@ -121,8 +121,9 @@ class Leeway:
     def explained(
         self, off: np.ndarray, std: np.ndarray, one_way: bool | np.ndarray = False
     ) -> np.ndarray:
-        """Whether differences (..., 4) of paths' measures may be nothing, by their deviations and
-        whether they are of an active terminal's echo over a wall on `one_way` (...)."""
+        """Return whether differences (..., 4) of paths' measures are insignificant, by their
+        deviations and whether they are of an active terminal's echo over a wall on `one_way` (...).
+        """
         off = wrapped(off, self.ambiguity)
         if np.isfinite(self.turn):
             off[..., 2:] -= self.turn * np.round(off[..., 2:] / self.turn)
@@ -135,7 +136,7 @@ class Leeway:
 
 @dataclass(frozen=True)
 class Suspicion:
-    """What the test says of K tracks.
+    """Result of the test for K tracks.
 
     Attributes
     ----------
@@ -227,7 +228,7 @@ def suspicion(
 def echoes(
     state: np.ndarray, own: Pose, walls: Walls, reach: float = np.inf
 ) -> list[tuple[int, int, np.ndarray]]:
-    """What a body shows of itself over each single wall: (face, order, (4,) range, range rate, u_x,
+    """Return a target's echoes over each single wall: (face, order, (4,) range, range rate, u_x,
     u_z), images beyond `reach` [m] left out.
 
     `state` (6,) is position and velocity relative to the terminal, world axes. Over the wall on
@@ -255,9 +256,9 @@ def reflections(
     walls: Walls,
     reach: float = np.inf,
 ) -> list[tuple[int, int, np.ndarray]]:
-    """What a passive terminal hears of a body over walls, one wall on each way at most: (first
-    face, order, (4,) path length, its rate, u_x, u_z), images beyond `reach` [m] of either end left
-    out.
+    """Return a target's paths over walls at a passive terminal, one wall on each segment at most:
+    (first face, order, (4,) path length, its rate, u_x, u_z), images beyond `reach` [m] of either
+    end left out.
 
     `state` and `sender` (6,) are the body's and the active terminal's, relative to the own pose.
     With `sender` None the body is the active terminal itself: its line of sight over a wall. The

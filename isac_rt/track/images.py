@@ -1,4 +1,4 @@
-"""What a terminal hears over the walls of its mesh: its own mirror images, or its transmitter's.
+"""Mirror images that a terminal receives over the walls of its mesh: its own, or its transmitter's.
 
 A wall that is met at a right angle sends the terminal's chirps straight back, and so does a corner
 of two planes, wall and ground above all, whatever the angle. Such an echo stands still in the world

@@ -1,5 +1,5 @@
-"""What a terminal may have besides its receiver and its tracker: rules for its tracks, a model of
-its own hardware, and reading over other paths. Without any of them it detects and tracks.
+"""Optional parts of a terminal besides its receiver and its tracker: rules for its tracks, a model
+of its own hardware, and reading over other paths. Without any of them it detects and tracks.
 
 The classes here do nothing; those that do are handed in (`isac_rt.track.standard`).
 """
@@ -48,7 +48,7 @@ def of_itself(own: Pose) -> Gaussian:
 
 @dataclass(frozen=True)
 class Own:
-    """What a terminal knows of a frame besides its samples.
+    """Knowledge of a terminal about a frame besides its samples.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ def is_placed(sender: Gaussian, cell: float) -> bool:
 
 
 class HardwareModel(Stateful):
-    """What a terminal knows of its own hardware: by itself that it is ideal."""
+    """Knowledge of a terminal about its own hardware: by default that it is ideal."""
 
     @property
     def clock(self) -> np.ndarray:
@@ -161,7 +161,7 @@ class OtherPaths(Stateful):
 
     @property
     def is_reading(self) -> bool:
-        """Whether a path is known over which data are read."""
+        """True if a path is known over which data are read."""
         return False
 
     def read_frame(
@@ -192,7 +192,7 @@ class OtherPaths(Stateful):
 
 @dataclass(frozen=True)
 class Equipment:
-    """What a terminal has besides its receiver and its tracker; by default nothing.
+    """Parts of a terminal besides its receiver and its tracker; by default none.
 
     Attributes
     ----------

@@ -64,7 +64,7 @@ _POSITION = np.array([0, 2, 3])
 
 @dataclass(frozen=True)
 class Look:
-    """What a terminal says of one frame of a link: the detections that its tracks took.
+    """Report of a terminal about one frame of a link: the detections that its tracks took.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Body:
-    """What is known of a body beside its state.
+    """Knowledge about a target besides its state.
 
     Attributes
     ----------
@@ -190,8 +190,8 @@ class Lives:
 
 @dataclass
 class _Known:
-    """What a pooled tracker carries over: the states before the looks that may still be preceded by
-    late ones, and these looks with the states (6,) of their transmitters."""
+    """State of a centralised tracker: the states before the dwells that may still be preceded by
+    late ones, and these dwells with the states (6,) of their transmitters."""
 
     begin: Pool
     looks: list[tuple[Look, np.ndarray | None]] = field(default_factory=list)
@@ -426,8 +426,8 @@ class PooledTracker(Stateful):
         )
 
     def _strays(self, pool: Pool, look: Look, q: int) -> bool:
-        """Whether the track of a detection that no body explains fed one lately: it is an outlier,
-        and no body of its own unless this goes on."""
+        """Return whether the track of a detection that no target explains fed one lately: it is an
+        outlier, and no target of its own unless this goes on."""
         feeds = [body.fed.get(look.origin, (None, -np.inf)) for body in pool.bodies]
         mine = [time for number, time in feeds if number == int(look.numbers[q])]
         return any(look.time - time < self._lives.window for time in mine)
@@ -523,13 +523,13 @@ class _View:
         return pose, self.transmitter - x[other : other + SIZE]
 
     def clock(self, x: np.ndarray) -> float:
-        """What the link's clocks add to its ranges [m]."""
+        """Return what the link's clocks add to its ranges [m]."""
         return 0.0 if self.clock_state is None else float(x[self.clock_state])
 
     def measured(
         self, x: np.ndarray, body: np.ndarray, own: Pose, sender: np.ndarray | None
     ) -> np.ndarray:
-        """What is measured of a body (4,)."""
+        """Return the measurement of a target (4,)."""
         z = measure(body, own, sender)
         z[0] += self.clock(x)
         return z
@@ -559,7 +559,7 @@ def _error_variance() -> np.ndarray:
 
 
 def _apart(a: Body, b: Body) -> bool:
-    """Whether a receiver saw both in one frame."""
+    """Return whether a receiver saw both in one frame."""
     return any(of[1] == b.fed[link][1] for link, of in a.fed.items() if link in b.fed)
 
 

@@ -62,7 +62,7 @@ cell."""
 
 
 class TerminalState(IntEnum):
-    """What a terminal says of its link."""
+    """State of a terminal's link."""
 
     ACQUIRING = 0  # nothing known yet
     TRACKING = 1  # its reference path is in sight
@@ -71,7 +71,7 @@ class TerminalState(IntEnum):
 
 @dataclass
 class Followed:
-    """What is carried over of a reference.
+    """State that is carried over of a reference.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class Reference(Stateful):
 
     @property
     def track(self) -> Track | None:
-        """Of the transmitter; None before acquisition."""
+        """Track of the transmitter; None before acquisition."""
         return self.state.track
 
     def predict(self, time: float) -> None:

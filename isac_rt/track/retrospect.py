@@ -49,8 +49,7 @@ class Waiting:
 
 
 class Retrospect(OtherPaths):
-    """What a passive terminal keeps of frames that it could not read, and the path over which it
-    reads now.
+    """Frames that a passive terminal could not read, and the path over which it reads now.
 
     Parameters
     ----------
@@ -207,5 +206,5 @@ class Retrospect(OtherPaths):
         return out
 
     def _deviations(self, detections: Detections, i: int) -> np.ndarray:
-        """Of range and velocity of a detection (2,)."""
+        """Return the standard deviations of range and velocity of a detection (2,)."""
         return np.maximum(detections.std[i, :2], STD_CELLS * self._cells)

@@ -81,8 +81,8 @@ class Sight(NamedTuple):
 
 
 class Change(NamedTuple):
-    """How much less paths are seen late [s], with their delay's rate, and off in u_x and u_z (2,)
-    than before a frame; `spread` (2,) is what an estimate of direction may differ from that."""
+    """Change of a terminal's hardware since an earlier frame: delay [s] with its rate, and offset
+    in u_x and u_z (2,); `spread` (2,) is the deviation of a direction estimate from that."""
 
     delay: float
     rate: float
@@ -118,7 +118,7 @@ class Belief:
 
 @dataclass
 class Hardware:
-    """What is known of a terminal's hardware.
+    """Estimate of a terminal's hardware.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class Hardware:
 
 
 class SelfCalibration(HardwareModel):
-    """What a terminal knows of its hardware, and the correction of its samples by it.
+    """Estimator of a terminal's hardware, and the correction of its samples by it.
 
     Parameters
     ----------

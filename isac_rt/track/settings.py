@@ -53,7 +53,7 @@ class Tracking(Node):
 
     @property
     def needs_mesh(self) -> bool:
-        """Whether births are held against a city's mesh."""
+        """True if track initiations are tested against a city's mesh."""
         return self.births == "unexplained"
 
     def problems(self) -> Iterator[Problem]:
@@ -81,8 +81,8 @@ Rectangle = Annotated[tuple[Finite, Finite, Finite, Finite], BeforeValidator(_fo
 
 
 class Belief(Node):
-    """What terminals believe wrongly of themselves and of the city, to see what it costs them. What
-    is sent, and what returns, is as it truly is."""
+    """Errors in what terminals believe of themselves and of the city, to measure their cost.
+    Transmission and echoes follow the truth."""
 
     missing_m: tuple[Rectangle, ...] = ()
     """Rectangles [x_min, y_min, x_max, y_max] on the ground whose buildings are missing in the

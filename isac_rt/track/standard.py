@@ -29,7 +29,7 @@ from isac_rt.world.swarm import Pose
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a passive terminal knows of the city.
+    """Knowledge of a passive terminal about the city.
 
     Attributes
     ----------

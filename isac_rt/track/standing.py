@@ -167,8 +167,8 @@ class Standing(TrackRule):
         return some
 
     def holds(self, track: Track) -> bool:
-        """Whether a track stands still, as far as is known of it, within a crowd or on a face, or
-        flies where no UAV can, in a face."""
+        """Return whether a track is static, as far as is known of it, within a crowd or on a face,
+        or flies where no UAV can, in a face."""
         place = track.state.mean[:3]
         spread = float(np.sqrt(np.linalg.eigvalsh(track.state.covariance[:3, :3])[-1]))
         if not rests(track):
@@ -178,15 +178,15 @@ class Standing(TrackRule):
 
 
 def rests(track: Track) -> bool:
-    """Whether a track stands still, as far as is known of it."""
+    """Return whether a track is static, as far as is known of it."""
     velocity, P = track.state.mean[3:6], track.state.covariance[3:6, 3:6]
     d2 = velocity @ np.linalg.solve(P + STILL_MPS**2 * np.eye(3), velocity)
     return bool(d2 < STANDS)
 
 
 def _spots(places: np.ndarray) -> int:
-    """How many of places (n, 3) are apart from each other, up to `CROWD`: a body that hovers nearby
-    is one, however often it was seen."""
+    """Count the places (n, 3) that are apart from each other, up to `CROWD`: a target that hovers
+    nearby is one, however often it was seen."""
     spots: list[np.ndarray] = []
     for place in places:
         if all(np.linalg.norm(place - spot) > BESIDE_M[0] for spot in spots):

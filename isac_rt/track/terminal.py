@@ -59,7 +59,7 @@ class Receiver(Protocol):
 
 @dataclass
 class OwnErrors:
-    """What clutter has said so far of an active terminal's own velocity and of its level."""
+    """Estimate from clutter so far of an active terminal's own velocity and level errors."""
 
     correction: Correction | None = None
 
@@ -208,7 +208,7 @@ class PassiveTerminal(Stateful):
 
     @property
     def status(self) -> TerminalState:
-        """Of the link."""
+        """Return the status of the link."""
         return self.reference.state.status
 
     def step(

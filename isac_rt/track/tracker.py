@@ -109,7 +109,7 @@ class Track:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackSet:
-    """What a terminal knows after a frame, relative to its own known pose, at the middle of the
+    """Tracks of a terminal after a frame, relative to its own known pose, at the middle of the
     frame.
 
     Attributes
@@ -204,7 +204,7 @@ def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None
 
 @dataclass
 class Followed:
-    """What a tracker carries over: its tracks at a time [s], and the number of the next one."""
+    """State that a tracker carries over: its tracks at a time, and the number of the next one."""
 
     tracks: list[Track] = field(default_factory=list)
     time: float = -np.inf
@@ -305,8 +305,8 @@ class Tracker(Stateful):
         return track_set(self.tracks, own, reference)
 
     def to_prediction(self, own: Pose, reference: Track) -> Prediction:
-        """What a PT expects of this frame: row 0 its line of sight, then the confirmed reflectors
-        seen in the last frame, weighted by their last SNR over the strongest's."""
+        """Predict the paths of this frame at a PT: row 0 its line of sight, then the confirmed
+        reflectors seen in the last frame, weighted by their last SNR over the strongest's."""
         seen = [t for t in self.tracks if t.confirmed and t.missed == 0]
         report = track_set(seen, own, reference)
         snr = np.array([reference.snr] + [t.snr for t in seen])

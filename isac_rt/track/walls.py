@@ -69,8 +69,8 @@ class Walls:
         return np.flatnonzero((away**2).sum(axis=1) < reach**2)
 
     def within(self, place: np.ndarray, reach: float) -> bool:
-        """Whether a face of a mirror lies within reach [m] of a place (3,); none does within less
-        than nothing."""
+        """Return whether a face of a mirror lies within reach [m] of a place (3,); none does within
+        less than nothing."""
         if reach <= 0:
             return False
         near = self.about(place, reach)
@@ -81,7 +81,8 @@ class Walls:
         return bool(self.holds(near, feet, reach).any())
 
     def bounded(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
-        """Whether points (n, 3) lie in the box about a mirror's faces, or within `edge` of it."""
+        """Return whether points (n, 3) lie in the box about a mirror's faces, or within `edge` of
+        it."""
         low, high = self.boxes
         return ((points >= low[mirrors] - edge) & (points <= high[mirrors] + edge)).all(axis=1)
 
@@ -122,8 +123,8 @@ class Walls:
         return tried[shown], np.hstack([places, motions])[shown]
 
     def holds(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
-        """Whether points (n, 3) in the planes of mirrors (n,) lie on one of their faces, or within
-        `edge` of it."""
+        """Return whether points (n, 3) in the planes of mirrors (n,) lie on one of their faces, or
+        within `edge` of it."""
         corners, inward, first = self._sides
         count = first[mirrors + 1] - first[mirrors]
         which = np.repeat(np.arange(mirrors.size), count)
@@ -138,8 +139,8 @@ class Walls:
 
     @cached_property
     def _sides(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the mirrors' faces one after the other the corners (n, 3, 3), and what points from the
-        side behind each to the inside, as long as the side; where each mirror's begin."""
+        """Return the corners (n, 3, 3) of the mirrors' faces one after the other, and vectors from
+        the side behind each to the inside, as long as the side; where each mirror's begin."""
         faces, first, _ = self._faces
         corners = self.city.corners[faces]
         along = np.roll(corners, -1, axis=1) - corners

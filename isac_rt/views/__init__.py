@@ -1,2 +1,2 @@
-"""What people and other programs see of a run: figures, pictures, animations, the report, files of
+"""Views of a run for people and other programs: figures, pictures, animations, the report, files of
 other tools."""

@@ -77,7 +77,7 @@ def animate(
 
 
 class _Moving:
-    """What moves in the map view."""
+    """Moving parts of the map view."""
 
     def __init__(self, ax: Axes, dataset: xr.Dataset, observer: int) -> None:
         self._d, self._ax, self._observer = dataset, ax, observer

@@ -379,8 +379,9 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
 
 
 def _processed(dataset: xr.Dataset, observer: int) -> Callable[[str], np.ndarray]:
-    """What gives variables of one observer by name, in the frames that it processed: an active
-    terminal may skip most. As arrays, since the dataset's own indexing loads dask."""
+    """Return the function that gives variables of one observer by name, in the frames that it
+    processed: an active terminal may skip most. As arrays, since the dataset's own indexing loads
+    dask."""
     frames = np.flatnonzero(dataset.processed.values[:, observer])
 
     @cache
@@ -534,7 +535,7 @@ def path_counts(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
 
 @dataclass(frozen=True)
 class Style:
-    """How figures are drawn for a place.
+    """Style of figures for a medium.
 
     Attributes
     ----------

@@ -39,8 +39,8 @@ variables a dataset has."""
 
 
 def layout(low: np.ndarray, high: np.ndarray) -> dict[str, Any]:
-    """How a scene is laid out: metres alike on all axes, seen from the south-east; of faces that
-    reach beyond the rectangle from `low` to `high` (2,) [m] the rest is cut off."""
+    """Lay out a scene: metres alike on all axes, seen from the south-east; faces are cut to the
+    rectangle from `low` to `high` (2,) [m]."""
     axes: dict[str, dict[str, Any]] = {
         f"{a}axis": {"title": {"text": title}}
         for a, title in zip(_AXES, ("east [m]", "north [m]", "up [m]"), strict=True)
@@ -199,7 +199,7 @@ class _Moving:
         return [trace | {"name": n} for trace, n in zip(traces, self.names, strict=True)]
 
     def _mark(self, name: str) -> dict[str, Any]:
-        """How the bodies of a picture are drawn."""
+        """Return the markers of targets."""
         if name == SWARM:
             return {"size": 9, "symbol": "diamond-open", "color": "black"}
         uav = self._d.uav.values.tolist().index(name)

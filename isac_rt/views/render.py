@@ -129,8 +129,8 @@ def depth_buffer(
 
 
 def is_hidden(points: np.ndarray, view: View, depth: np.ndarray, slack: float = 0.6) -> np.ndarray:
-    """Whether world points (..., 3) lie more than `slack` [m] behind what the depth buffer shows
-    there."""
+    """Return whether world points (..., 3) lie more than `slack` [m] behind the surface in the
+    depth buffer."""
     height, width = depth.shape
     p = view.pixels(points, width, height)
     column = np.clip(p[..., 0].astype(int), 0, width - 1)

@@ -107,8 +107,9 @@ _CITY = ("ghost", "specular", "diffuse")
 
 
 def city_costs(summary: Mapping[str, Any]) -> Table:
-    """What the city costs each set of receivers: what it finds, what it would find in noise alone,
-    what hides the rest, and what the city makes it believe; no rows where none are compared."""
+    """Tabulate what the city costs each set of receivers: what it finds, what it would find in
+    noise alone, what hides the rest, and what the city makes it believe; no rows where none are
+    compared."""
     causes = {"Masked": "masked", "Clutter": "clutter", "Not read": "not_read"}
     rows = []
     for link, name, one in _sets(summary):
@@ -164,8 +165,8 @@ _OUTSIDE = ("out_of_view", "beyond_range", "too_near", "too_fast")
 
 
 def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
-    """What the radar can see: one row for each set of links that see alike, the times and what the
-    columns mean in words, and the frames in which UAVs are outside.
+    """Tabulate the coverage of the radar: one row for each set of links that see alike, the times
+    and what the columns mean in words, and the frames in which UAVs are outside.
 
     Parameters
     ----------
@@ -296,7 +297,8 @@ def swarm_table(summary: Mapping[str, Any]) -> Table:
 
 
 def _traffic(picture: Mapping[str, Any], told: bool) -> tuple[str, str, str]:
-    """What the messages to a terminal left out, their bits, and those of them that were lost."""
+    """Tabulate what the messages to a terminal left out, their bits, and those of them that were
+    lost."""
     if not told:
         return DASH, DASH, DASH
     bits = f"{number(picture['bits'] / 1e3)} of {number(picture['bits_room'] / 1e3)}"
@@ -360,7 +362,7 @@ def _pairs(middle: Mapping[str, float | None], most: Mapping[str, float | None])
 
 
 def loss_table(summary: Mapping[str, Any]) -> Table:
-    """What became of every target-frame in view; causes that never were are left out."""
+    """Tabulate the outcome of every target-frame in view; causes without frames are left out."""
     rows = list(_targets(summary))
     causes = [c for c in LOSSES if any(t["losses"][c] for _, _, t in rows)]
     titles = (cause.replace("_", " ").capitalize() for cause in causes)

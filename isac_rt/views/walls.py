@@ -1,4 +1,4 @@
-"""Which of the city's surfaces stand behind what a radar saw that is no UAV."""
+"""Surfaces of the city behind detections that are no UAV."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What depends on the direction in a body's frame, interpolated from a table."""
+"""Quantities that depend on the direction in the body frame, interpolated from a table."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def hits(corners: np.ndarray, start: np.ndarray, end: np.ndarray) -> tuple[np.nd
 
 
 def enclosed(city: CityMesh, place: np.ndarray) -> bool:
-    """Whether a place (3,), local, lies inside a building or under the ground.
+    """Return whether a place (3,), local, lies inside a building or under the ground.
 
     Inside a building an odd number of faces lies above, and in most directions about, whether it
     has a floor or not. Under the ground nothing lies below, and something above in every direction.

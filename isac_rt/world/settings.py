@@ -427,7 +427,7 @@ class Uav(Node):
 
 
 def _too_fast(speed: float) -> str:
-    """What is wrong with a speed [m/s]."""
+    """Return what is wrong with a speed [m/s]."""
     return (
         f"a flight at {speed:.4g} m/s is faster than the {MAX_SPEED_MPS:g} m/s that are modelled; "
         "fly slower"

@@ -30,7 +30,8 @@ MOST_CELLS = 8_000_000
 
 @dataclass(frozen=True)
 class Density:
-    """How finely surfaces are cut: a cell's area is at most max(smallest, per_metre * distance).
+    """Fineness of the cells that surfaces are cut into: an area is at most max(smallest, per_metre
+    * distance).
 
     Near a flight it is `FINER` times smaller.
 

@@ -68,7 +68,7 @@ these places is left out."""
 
 
 class Surfaces(NamedTuple):
-    """What the kernel needs of a city's faces and materials.
+    """Faces and materials of a city, as the kernel needs them.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class Surfaces(NamedTuple):
 
 @dataclass(frozen=True)
 class Seen(Ways):
-    """What K scatterers of the field do between two terminals at one instant, isotropic antennas.
+    """K scatterers of the field between two terminals at one instant, isotropic antennas.
 
     Float32 where that is enough (magnitude, acceleration); what both ends of a terminal's own link
     share is one array.
@@ -200,7 +200,7 @@ def scattered_power(
 
 
 class Scatterers(NamedTuple):
-    """Those that a link sees, and from where."""
+    """Scatterers that a link sees, and from where."""
 
     cells: Cells
     sight: Sight
@@ -292,7 +292,7 @@ class ClutterField:
         )
 
     def of(self, link: Link) -> Scatterers:
-        """What a link sees."""
+        """Return the scatterers that a link sees."""
         return self.merged.get(link, Scatterers(self.cells, self.sight))
 
     def whole(self) -> ClutterField:
@@ -347,8 +347,8 @@ class ClutterField:
     def _heard(
         self, floor: NoiseFloor, cells: Cells, share: np.ndarray, state: LinkState, level: float
     ) -> Heard:
-        """What a link hears of cells of which both ends see shares (N,); `level` is the power of a
-        path over the noise, per power gain."""
+        """Return a link's paths over cells that both ends see by shares (N,); `level` is the power
+        of a path over the noise, per power gain."""
         ways = self._ways(cells, share, state)
         power = level * (ways.magnitude * state.elements(floor.antennas, ways)) ** 2
         delay = ways.length / SPEED_OF_LIGHT
@@ -367,8 +367,8 @@ class ClutterField:
         )
 
     def seen(self, state: LinkState, bodies: Bodies | None = None) -> Seen:
-        """What is in sight of both ends of a link, poses in local coordinates; in the shadows of
-        `bodies`, if given."""
+        """Return the scatterers in sight of both ends of a link, poses in local coordinates; in the
+        shadows of `bodies`, if given."""
         (tx, rx), own, start, end = state.link, state.link.own, state.start, state.end
         cells, sight = self.of(state.link)
         share = sight.share(tx, start, state.epoch)
@@ -392,14 +392,14 @@ class ClutterField:
         return Seen(*(parts[id(a)] for a in vars(found).values()))
 
     def from_places(self, state: LinkState) -> Seen:
-        """What is in sight of both ends by rays alone, wherever they are; poses in local
+        """Return the scatterers in sight of both ends by rays alone, at any place; poses in local
         coordinates."""
         ends = np.array([state.start.position, state.end.position])
         one, other = self.sight.from_places(ends)
         return self._ways(self.cells, (one & other).astype(np.float32), state)
 
     def _ways(self, cells: Cells, share: np.ndarray, state: LinkState) -> Seen:
-        """What cells do of which both ends see shares (N,) that are not 0."""
+        """Return the paths over the cells that both ends see by shares (N,) other than 0."""
         own, start, end = state.link.own, state.start, state.end
         index = np.flatnonzero(share).astype(np.int32)
         count = index.size

@@ -86,7 +86,7 @@ def resolution_cell(waveform: Waveform, delay: np.ndarray, rate: np.ndarray) -> 
 
 
 class Heard(NamedTuple):
-    """What a link hears of some scatterers at one instant.
+    """Scatterers as a link receives them at one instant.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class Heard(NamedTuple):
 
 
 def covered(cells: Cells, heard: Sequence[Heard], finest: np.ndarray, error_db: float) -> Cells:
-    """What is left of a link's scatterers.
+    """Merge a link's scatterers as far as noise covers the error.
 
     Parameters
     ----------
@@ -123,8 +123,9 @@ def covered(cells: Cells, heard: Sequence[Heard], finest: np.ndarray, error_db: 
 
 
 def _within(error_db: float, times: np.ndarray, heard: Sequence[Heard]) -> bool:
-    """Whether nine of ten range-Doppler cells keep an error at every instant, of all and of those
-    whose clutter is over the noise, if scatterers (N,) stand for so many times their power."""
+    """Return whether nine of ten range-Doppler cells keep an error at every instant, among all and
+    among those whose clutter is over the noise, if scatterers (N,) represent multiples of their
+    power."""
     for which, power, cell in heard:
         every, left = np.bincount(cell, power), np.bincount(cell, power * times[which])
         held = np.flatnonzero(every)
@@ -135,8 +136,7 @@ def _within(error_db: float, times: np.ndarray, heard: Sequence[Heard]) -> bool:
 
 
 def apart_db(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """How far noise and clutter together are from each other, of two clutters over the noise
-    [dB]."""
+    """Return the difference of noise plus clutter between two clutters over the noise [dB]."""
     return np.abs(10 * np.log10((1 + other) / (1 + one)))
 
 

@@ -1,5 +1,5 @@
-r"""Which walls a terminal sees the city in: the mirrors of two-bounce clutter, chosen once for a
-run, and what shows in them.
+r"""Mirrors of two-bounce clutter: the walls over which a terminal sees the city, chosen once for a
+run.
 
 A mirror is all faces of one plane and one material. Of all mirrors a terminal keeps those that send
 on the most of what it radiates,

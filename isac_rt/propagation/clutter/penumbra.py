@@ -90,7 +90,8 @@ class Facets(NamedTuple):
 def crossings(
     triangles: Triangles, knots: np.ndarray, seen: np.ndarray, facets: Facets, wavelength: float
 ) -> Crossings:
-    """What changes between two knots (2, 3), of N points on surfaces, seen (2, N) from either."""
+    """Return what changes between two time samples (2, 3), for N points on surfaces, seen (2, N)
+    from either."""
     index = np.flatnonzero(seen[0] != seen[1]).astype(np.int32)
     gained = seen[1][index].astype(bool)
     some = facets.select(index)

@@ -68,7 +68,7 @@ class RayleighClutter:
         self._waveform, self._half_view = waveform, reference.antennas.half_view
 
     def census(self) -> Census:
-        """What the model below holds."""
+        """Return the census of the underlying model."""
         return self.model.census()
 
     def trace(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Traced:

@@ -1,4 +1,4 @@
-"""What is seen from where: shadow rays, and how sight of a scatterer comes and goes along a flight.
+"""Visibility: shadow rays, and the visibility of a scatterer along a flight.
 
 Rays are tested from knots, places every half metre along a flight as it is planned. Where a
 scatterer is seen from one knot and not from the next, `penumbra` finds the shadow edge in between,
@@ -90,7 +90,7 @@ class Flight:
         return np.column_stack([each, begins, np.full(len(each), turn)])
 
     def holds(self, pose: Pose, time: float) -> bool:
-        """Whether a pose, local, is the planned one."""
+        """Return whether a pose, local, is the planned one."""
         return bool(
             np.linalg.norm(self._trajectory.pose(time).position - self._origin - pose.position)
             < OFF_FLIGHT
@@ -135,8 +135,8 @@ class _Stretch(NamedTuple):
 
 
 class Sight:
-    """How far N points are in sight of each terminal at any time of a run: 0, 1, and the modulus of
-    the knife edge's factor in between.
+    """Visibility of N points from each terminal at any time of a run: 0, 1, and the modulus of the
+    knife edge's factor in between.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ class Sight:
         )
 
     def _stretch(self, name: str, number: int) -> _Stretch:
-        """What is seen, and crosses edges, along a stretch of a flight."""
+        """Return what is visible, and what crosses edges, along a stretch of a flight."""
         if (name, number) not in self._stretches:
             knots = self.flights[name].knots[TOGETHER * number : TOGETHER * (number + 1) + 1]
 
@@ -246,7 +246,7 @@ class Sight:
         return self._stretches[name, number]
 
     def _crossings(self, knots: np.ndarray, seen: np.ndarray) -> Crossings:
-        """What crosses an edge between two knots (2, 3), seen (2, N) from either."""
+        """Return what crosses an edge between two time samples (2, 3), seen (2, N) from either."""
         return crossings(self.shadows.triangles, knots, seen, self._facets, self._wavelength)
 
 

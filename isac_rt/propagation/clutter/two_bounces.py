@@ -50,7 +50,7 @@ how far."""
 
 @dataclass(frozen=True)
 class SeenByMirror:
-    """What K scatterers do between two terminals by way of one mirror.
+    """K scatterers between two terminals by way of one mirror.
 
     Attributes
     ----------
@@ -106,8 +106,8 @@ class TwoBounces:
         }
 
     def seen(self, state: LinkState, bodies: Bodies | None = None) -> list[SeenByMirror]:
-        """What is in sight of both ends, once for each mirror and order; poses in local
-        coordinates."""
+        """Return the scatterers in sight of both ends, once for each mirror and order; poses in
+        local coordinates."""
         sight, time = self._field.sight, state.epoch
         ends = zip(state.link, (state.start, state.end), strict=True)
         tx, rx = (

@@ -1,5 +1,5 @@
-"""Which walls a wave may meet one after the other: rays find the chains, once for a stretch of
-flight.
+"""Interaction sequences: rays find which walls a wave may meet one after the other, once for a
+stretch of flight.
 
 Rays leave a terminal from knots, places at even distances along its planned flight, in directions
 that differ from knot to knot, and are mirrored at each wall that they hit. What they find are

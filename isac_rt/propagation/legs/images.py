@@ -216,7 +216,7 @@ class Images:
     def _settled(
         self, parts: list[_Candidates], clear: list[np.ndarray], pairs: list[Link]
     ) -> dict[Link, LegSet]:
-        """What is a path, once, sorted by pair, bounces and length, with its amplitudes."""
+        """Return each path once, sorted by pair, bounces and length, with its amplitudes."""
         sets, owners = [], []
         for part, good in zip(parts, clear, strict=True):
             planes = edges_in_any_order(self._city.plane_of_face[part.faces], part.legs.points)

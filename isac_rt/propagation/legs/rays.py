@@ -102,7 +102,7 @@ class Shadows:
 
     @cached_property
     def triangles(self) -> Triangles:
-        """Of the scene."""
+        """Return the triangles of the scene."""
         return Triangles(self.scene)
 
     def ever_sees(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:

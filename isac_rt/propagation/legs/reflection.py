@@ -1,5 +1,5 @@
-"""What mirror reflections do to a vertically polarised wave: slab coefficients along chains of
-walls, in float64."""
+"""Reflection of a vertically polarised wave: slab coefficients along sequences of walls, in
+float64."""
 
 from __future__ import annotations
 

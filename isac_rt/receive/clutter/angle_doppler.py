@@ -283,14 +283,14 @@ def near_beam(
 
 
 def correct(power: np.ndarray, known: Known, clutter: ExpectedClutter) -> Correction:
-    """What the frame says of the terminal's own velocity and of the level that it expects."""
+    """Estimate from the frame the terminal's own velocity and the level that it expects."""
     expected = expected_power(clutter, known, len(power))
     return fit(power, noise_level(power, expected, known.channels), clutter, known)
 
 
 def in_skirt(rows: np.ndarray, bins: np.ndarray, power: np.ndarray, first: int) -> np.ndarray:
-    """Which cells hold no more than the lobes of the strongest path before the row `first`: the
-    transmitter's leakage."""
+    """Mark the cells that hold no more than the sidelobes of the strongest path before the row
+    `first`: the transmitter's leakage."""
     row, column = np.unravel_index(power[:first].argmax(), power[:first].shape)
     lobes = leaked(rows - row, bins - column, power.shape[1], UNION_FLOOR)
     return np.asarray(power[rows, bins] <= LOBE_MARGIN * power[row, column] * lobes)

@@ -97,7 +97,7 @@ class BeamSearch(BySchedule):
     def _noise(
         self, power: np.ndarray, known: Known, clutter: ExpectedClutter | None
     ) -> tuple[float, np.ndarray]:
-        """Of a cell of one channel, and the clutter's (rows, P), Doppler centred."""
+        """Return the noise of a cell of one channel, and the clutter's (rows, P)."""
         if clutter is None:
             return noise_level(power, None, known.channels), np.zeros_like(power)
         expected = expected_power(clutter, known, len(power), TAPER)
@@ -152,7 +152,7 @@ class BeamSearch(BySchedule):
 
 @dataclass(frozen=True)
 class Remainder:
-    """What the removal of strong paths may have left about them, which comes from where they came.
+    """Residue of the removal of strong paths, from their directions.
 
     Attributes
     ----------

@@ -79,8 +79,8 @@ def runs(power: np.ndarray, looks: float, least: int) -> np.ndarray:
 
 
 def _in_runs(occupied: np.ndarray, least: int) -> np.ndarray:
-    """Which cells of lines lie in runs of at least `least` occupied ones, gaps closed, with a
-    margin."""
+    """Mark the cells of lines that lie in runs of at least `least` occupied ones, gaps closed, with
+    a margin."""
     apart = max(GAP, 2 * MARGIN) + 1  # empty cells between the lines keep their runs apart
     wide = np.pad(occupied, ((0, 0), (MARGIN, apart)))
     at = np.flatnonzero(wide)

@@ -48,7 +48,8 @@ class Gate:
         return (np.abs(cosines - self.middle) <= self.half).all(axis=-1)
 
     def threshold(self, search: Search, rate: float) -> float:
-        """What noise exceeds somewhere in the gate with probability `rate` at most."""
+        """Return the level that noise exceeds somewhere in the gate with probability `rate` at
+        most."""
         size = scanned_within(search.channels, search.wavenumber, 2 * self.half)
         return field_threshold(*size, 1, rate / self.cell.size)
 

@@ -128,7 +128,7 @@ class Response:
     def _places(
         self, beat: np.ndarray, doppler: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Which scatterers lie on the fine grid, the two places each of them has there, on the
+        """Place scatterers on the fine grid: which lie on it, the two places of each, on the
         nearest line and on both sides of its Doppler, and the shares that these take."""
         size, lines = self.waveform.num_chirps * FINE_DOPPLER, (self.rows + 2 * REACH) * FINE_BEAT
         line = np.rint((beat + REACH) * FINE_BEAT).astype(np.int64)

@@ -148,7 +148,7 @@ class _Descent:
 
     @property
     def _fewer(self) -> Weights:
-        """Of chirps by 1 and t alone."""
+        """Return the chirps' design with 1 and t alone."""
         return self.weights._replace(factors=self.weights.factors[:2])
 
     def _by_amplitude(self, sums: np.ndarray) -> np.ndarray:
@@ -352,7 +352,7 @@ def energy(known: Known, paths: Sequence[JointPath]) -> float:
 def residual_channels(
     moments: Moments, found: Fit, beside: Sequence[JointPath], offsets: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """What the paths of a fit leave at some places, channel by channel.
+    """Return what the paths of a fit leave at some places, channel by channel.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Which paths of a frame touch each other, and how much of another one each may ignore.
+"""Interaction between the paths of a frame, and how much of another one each may ignore.
 
 Two unit tones of a frame share at most the product of three factors of their signals: a Dirichlet
 kernel's envelope in beat, one in Doppler, and the array's pattern between their directions. An

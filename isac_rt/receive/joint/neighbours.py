@@ -198,8 +198,8 @@ def _near(known: Known, path: JointPath, start: JointPath) -> bool:
 
 
 def _credible(known: Known, paths: list[JointPath], before: list[JointPath], beside: int) -> bool:
-    """Whether a fit stayed near what was `before`, and the new path, the last, near where it was
-    found, within `WEAKEST_DB` of the one `beside` which that was and not on top of it."""
+    """Return whether a fit stayed near what was `before`, and the new path, the last, near where it
+    was found, within `WEAKEST_DB` of the one `beside` which that was and not on top of it."""
     if not all(_near(known, p, n) for p, n in zip(paths, before, strict=True)):
         return False
     power = [float((np.abs(p.amplitude) ** 2).mean()) for p in paths]

@@ -1,1 +1,1 @@
-"""How a passive terminal reads symbols."""
+"""Symbol decisions of a passive terminal."""

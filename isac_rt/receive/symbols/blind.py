@@ -123,7 +123,7 @@ class DataPath:
 
     @property
     def prediction(self) -> Prediction:
-        """What is expected of it."""
+        """Return the prediction of the path."""
         one, std = np.ones(1), np.sqrt(np.diag(self.covariance))
         return Prediction(
             range=one * self.mean[0],
@@ -283,7 +283,7 @@ class _Seen:
 
     @classmethod
     def of(cls, peaks: Peaks, weights: np.ndarray, last: float) -> _Seen:
-        """Of a frame, its middle counted from time `last`."""
+        """Return the peaks of a frame, its middle counted from time `last`."""
         power = np.abs(peaks.values @ weights) ** 2
         best = power.argmax(axis=-1)[..., None]
         cell = np.take_along_axis(peaks.cells, best, axis=-1)[..., 0].astype(float)

@@ -199,7 +199,7 @@ def nearest_symbols(summed: np.ndarray, order: int) -> tuple[np.ndarray, float]:
 
 
 def moves_as_predicted(symbols: Symbols, order: int) -> bool:
-    """Whether the DPSK phases gather at the symbols, as far as the noise lets this be seen.
+    """Return whether the DPSK phases gather at the symbols, as far as the noise lets this be seen.
 
     The delay decisions take whatever path is strongest, and the DPSK decisions take up the whole
     symbols of its Doppler, so that a reflection always ends up near the predicted cell. But unless

@@ -1,5 +1,5 @@
-"""Which polygons of a map are buildings, and how high they stand: by the tags of OpenStreetMap
-where a file has them, else by a property with heights."""
+"""Buildings among the polygons of a map, and their heights: by the tags of OpenStreetMap where a
+file has them, else by a property with heights."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Outline:
 
 
 def tags_of(properties: Tags) -> dict[str, Any]:
-    """What a feature is tagged with: flat, under `tags`, or in GDAL's `other_tags`."""
+    """Return a feature's tags: flat, under `tags`, or in GDAL's `other_tags`."""
     found = dict(properties)
     inner, other = properties.get("tags"), properties.get("other_tags")
     if isinstance(inner, str) and inner.startswith("{"):
@@ -117,8 +117,8 @@ class _Heights:
     wrong: list[str] = field(default_factory=list)
 
     def metres(self, tags: Tags, what: str, *keys: str) -> float | None:
-        """Of the first key that holds a length; zero is none, and a negative number is how tables
-        write that it is not known."""
+        """Return the length under the first key that holds one; zero is none, and a negative number
+        is how tables write that it is not known."""
         for key in keys:
             value = _value(tags, key)
             if isinstance(value, int | float) and value < 0:
@@ -221,7 +221,7 @@ def _most(left: Counter[str]) -> int:
 
 
 def _no_building(feature: Feature, tags: Tags, city: settings.City, mapped: bool) -> str | None:
-    """What a feature is that is no building; None if it is one."""
+    """Return what a feature is that is no building; None if it is one."""
     if feature.shape.is_empty:
         return "without a polygon"
     if _says(tags, "building") or _says(tags, "building:part"):

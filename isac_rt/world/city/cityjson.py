@@ -117,7 +117,7 @@ class _Templates(Part):
 
 
 class CityJson(Part):
-    """What is read of a CityJSON file."""
+    """Checked content of a CityJSON file."""
 
     type: Literal["CityJSON"]
     transform: _Transform | None = None
@@ -174,7 +174,7 @@ class Body:
 
 @dataclass
 class CityModel:
-    """What a CityJSON file holds, in its own coordinates.
+    """City of a CityJSON file, in its own coordinates.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def triangulate_planar(rings: list[NDArray[np.float64]]) -> NDArray[np.int64]:
 
 
 def _material(city: settings.City, semantic: str | None, kind: str) -> str:
-    """Of a surface, by the scenario's `material_map` or by what it is."""
+    """Return the material of a surface, by the scenario's `material_map` or by its semantics."""
     for name in (semantic, kind):
         if name is not None and name in city.material_map:
             return city.material_map[name]
@@ -449,8 +449,8 @@ class _Reader:
 
 
 def _height(attributes: Mapping[str, Any], key: str) -> float | None:
-    """What a building says of its height [m]: under `key`, as CityGML's `measuredHeight`, or as the
-    3D BAG's heights of roof and ground over the sea; None if it says nothing.
+    """Return a building's stated height [m]: under `key`, as CityGML's `measuredHeight`, or as the
+    3D BAG's heights of roof and ground over the sea; None if it states none.
 
     Raises
     ------
@@ -519,7 +519,7 @@ _CHECK = "check the file with a CityJSON validator"
 
 
 def is_sequence(data: bytes) -> bool:
-    """Whether a file is CityJSONSeq."""
+    """Return whether a file is CityJSONSeq."""
     return b'"CityJSONFeature"' in data
 
 

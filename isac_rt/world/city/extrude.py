@@ -28,7 +28,7 @@ def check_corners(count: int, what: str) -> None:
 
 
 def _crosses_often(geometry: shapely.Geometry) -> bool:
-    """Whether the rings meet themselves or others more often than can be repaired."""
+    """Return whether the rings meet themselves or others more often than can be repaired."""
     rings = shapely.get_rings(shapely.get_parts(shapely.get_parts(geometry)))
     points, ring = shapely.get_coordinates(rings, return_index=True)
     ends = np.stack([points[:-1], points[1:]], axis=1)[ring[1:] == ring[:-1]]

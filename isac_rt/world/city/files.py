@@ -1,5 +1,5 @@
-"""How a file of a city is read: whole, of a size that memory holds, from where it may lie, and
-checked against a schema."""
+"""Reading of a city's file: whole, of a size that memory holds, from where it may lie, and checked
+against a schema."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ SEEN_LOWERED_M = 0.5
 
 
 def _model(city: settings.City, path: Path, notes: list[str]) -> CityModel:
-    """What a file holds, in its own coordinates."""
+    """Return the content of a file, in its own coordinates."""
     if path.suffix.lower() in TABLES:
         features, crs = read_table(path, city.layer, notes)
         return CityModel(crs, buildings(features, city, path.name, notes))
@@ -131,7 +131,7 @@ def _moved(model: CityModel, place: Place) -> CityModel:
 def _ground(
     city: settings.City, model: CityModel, terrain: Path | None, place: Place, notes: list[str]
 ) -> Ground:
-    """What the city stands on."""
+    """Return the ground that the city stands on."""
     boxes = _boxes(model)
     plan = Plan(
         boxes[:, :2].min(axis=0),
@@ -251,7 +251,7 @@ def footprints(
 
 
 def _bodies(model: CityModel, base: Ground, replaced: bool, notes: list[str]) -> list[Surface]:
-    """What has surfaces of its own, down to the ground."""
+    """Return the parts that have surfaces of their own, down to the ground."""
     standing = feet_of(model.bodies)[0]
     down = dict(zip(map(id, standing), lowered(standing, base), strict=True))
     surfaces, deep = list[Surface](), list[float]()

@@ -95,7 +95,7 @@ class _Document(Part):
     crs: Any = None
 
     def named_crs(self) -> str:
-        """What the `crs` member says, "" if nothing."""
+        """Return what the `crs` member names, "" if nothing."""
         inside = self.crs.get("properties") if isinstance(self.crs, dict) else None
         said = inside.get("name") if isinstance(inside, dict) else None
         return said if isinstance(said, str) else ""

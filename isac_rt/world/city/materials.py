@@ -1,4 +1,4 @@
-"""What the city's surfaces are made of, at the carrier.
+"""Materials of the city's surfaces at the carrier.
 
 Dielectric constants follow ITU-R P.2040 [1]_ where it has a fit at the carrier. Where it has none,
 the rule by which a value is reached is stated in the material's `source`: interpolated between two
@@ -92,7 +92,7 @@ class Material:
 
 @dataclass(frozen=True)
 class MaterialUse:
-    """What a source says of a surface's material: a name of the table, perhaps a thickness, or the
+    """Material of a surface as a source states it: a name of the table, perhaps a thickness, or the
     material itself.
 
     `defined` is a material that a Mitsuba file spells out in numbers; its name need not be in the

@@ -195,8 +195,8 @@ class CityMesh:
         )
 
     def record(self) -> dict[str, Any]:
-        """What people and other programs ask of a city: its name, where it lies, what was
-        assumed."""
+        """Return the record of a city for people and other programs: its name, where it lies, what
+        was assumed."""
         place = self.place
         return {
             "name": self.name,

@@ -192,7 +192,7 @@ def _material(reader: _Reader, city: settings.City, bsdf: ET.Element) -> Materia
 
 @lru_cache(maxsize=1)
 def _reader(path: Path, content: bytes) -> _Reader:
-    """Of a file with some content, the same again: its digest is made before it is read."""
+    """Return a reader of a file whose content was read before for its digest."""
     parser = ET.XMLParser(target=_Tree())
     try:
         root = ET.fromstring(content, parser)

@@ -33,7 +33,7 @@ _WHOLE_M = 100.0
 
 @dataclass(frozen=True)
 class Place:
-    """How world coordinates relate to those of a city's file.
+    """Relation between world coordinates and those of a city's file.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Place:
 
     @property
     def is_lonlat(self) -> bool:
-        """Whether the file's coordinates are longitude and latitude."""
+        """Return whether the file's coordinates are longitude and latitude."""
         return bool(self.plane) and self._geodetic is None
 
     def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -118,7 +118,7 @@ def plane_about(lon: float, lat: float) -> str:
 
 
 def is_lonlat(boxes: NDArray[np.float64]) -> bool:
-    """Whether footprints look like degrees.
+    """Return whether footprints look like degrees.
 
     Parameters
     ----------

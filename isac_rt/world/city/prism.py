@@ -14,7 +14,7 @@ from isac_rt.world.city.mesh import Surface
 
 @dataclass(frozen=True)
 class Finish:
-    """What a building is made of."""
+    """Materials of a building."""
 
     wall: MaterialUse
     roof: MaterialUse

@@ -73,7 +73,7 @@ def city_files(city: settings.City | None, folder: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class CityParts:
-    """What a source of cities returns.
+    """Result of a source of cities.
 
     Attributes
     ----------

@@ -25,7 +25,7 @@ _SWITCHED_OFF = "ISAC_RT_DRIVERS_OFF"
 
 
 class _Refused(Exception):
-    """What the user can mend, in words of this program."""
+    """Error that the user can mend, in words of this program."""
 
 
 def _only_driver(driver: str) -> None:

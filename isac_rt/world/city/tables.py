@@ -103,7 +103,7 @@ def _check_start(name: str, table: Table, data: bytes) -> None:
 def _read_apart(
     table: Table, files: Sequence[tuple[str, bytes]], layer: str | None
 ) -> tuple[dict[str, Any], list[bytes]]:
-    """What `table_process` answers: its line, and each row's shape as well-known binary."""
+    """Return the answer of `table_process`: its line, and each row's shape as well-known binary."""
     size = sum(len(content) for _, content in files)
     seconds = _BASE_S + math.ceil(size * table.factor / _BYTES_PER_S)
     memory = _BASE_BYTES + int(size * table.factor)

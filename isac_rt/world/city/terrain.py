@@ -245,7 +245,7 @@ def feet_of(bodies: Sequence[Body]) -> tuple[list[Body], NDArray[np.float64]]:
 
 
 def _stands_on(body: Body, parts: Sequence[Body]) -> bool:
-    """Whether a part of a building has another one under it."""
+    """Return whether a part of a building has another one under it."""
     middle = body.vertices[body.foot, :2].mean(axis=0)
     level = body.vertices[body.foot, 2].min()
     for other in parts:
