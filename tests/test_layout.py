@@ -253,3 +253,15 @@ def test_rooms_do_not_grow(room: str):
     lines = sum(m.read_text().count("\n") for m in MODULES if room_of(m) == room)
     assert 0 < lines <= MAX_LINES[room]
     assert MAX_LINES.keys() == set(ORDER) - set(GROUND_FILES)
+
+
+PRIVATE_WORDS = ("Of", "What", "Whether", "Those", "How", "That", "Which")
+
+
+@pytest.mark.parametrize("path", MODULES, ids=ids)
+def test_docstrings_begin_with_a_verb_or_a_noun(path: Path):
+    """Planted bug: `Whether noise covers a path.` as a docstring in signal/noise.py."""
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, documented) and (text := ast.get_docstring(node)):
+            assert text.split()[0].strip(",.;:") not in PRIVATE_WORDS, text

@@ -1,4 +1,4 @@
-"""What a receiver knows of a frame beside its samples."""
+"""Knowledge of a receiver about a frame besides its samples."""
 
 from __future__ import annotations
 

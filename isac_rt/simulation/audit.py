@@ -432,7 +432,7 @@ def _clutter_error(setup: Setup, frame: Frame, link: Link) -> float:
 def clutter_by_cell(
     setup: Setup, frame: Frame, link: Link, field: ClutterField
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of the scatterers of a field the range-Doppler cells in which a link hears them, and their
+    """Return the range-Doppler cells in which a link receives the scatterers of a field, and their
     mean powers over the noise of a cell."""
     level = setup.plan.cell_noise_gain() / frame.noise_power(link)
     origin, epoch = setup.city.origin, setup.timetable.epoch(frame.number)

@@ -32,7 +32,7 @@ receivers know what they were told until so many frames before it."""
 
 @dataclass
 class Talk:
-    """What is on its way between terminals, and what each knew.
+    """Messages on their way between terminals, and what each knew.
 
     Attributes
     ----------
@@ -118,8 +118,8 @@ class Cooperation(Stateful):
         return {**views, SWARM: View(time, tuple(together))}
 
     def _bodies(self, name: str, view: View, time: float) -> list[KnownBody]:
-        """What a terminal knows of: other terminals by what they say of themselves, and the bodies
-        of its picture that are none of these."""
+        """Return the targets that a terminal knows of: other terminals by their reports, and the
+        fused tracks that are none of these."""
         said = self._notes[name].terminals
         mates = [
             KnownBody(other, advance(s.state, time - s.time, self._acceleration))
@@ -138,7 +138,7 @@ class Cooperation(Stateful):
         ]
 
     def _together(self, time: float, poses: Mapping[str, Pose]) -> list[Fused]:
-        """What all know together at a time [s]."""
+        """Return what all terminals know together at a time [s]."""
         known = {name: of_itself(poses[name]) for name in self._notes}
         if isinstance(self._swarm, PooledTracker):
             self._swarm.forget(time)
@@ -218,7 +218,7 @@ class Cooperation(Stateful):
     def _carry_late(
         self, late: Mapping[Link, Sequence[LateRecord]], came: dict[str, Traffic]
     ) -> None:
-        """What comes with frames that were read late, to be added to what `came`."""
+        """Add to `came` what arrives with frames that were read late."""
         for way, records in late.items():
             for one in records:
                 if way in self.state.channels and _corrected(one.symbols):
@@ -239,7 +239,7 @@ class Cooperation(Stateful):
 
 
 def _corrected(count: SymbolCount) -> bool:
-    """Whether the code of a frame that was read makes up for its errors."""
+    """Return whether the code of a frame that was read corrects its errors."""
     return count.bit_errors <= CORRECTED * count.bits_total
 
 

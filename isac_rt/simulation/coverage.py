@@ -1,5 +1,5 @@
-"""What a radar can see: ranges, velocities and angles link by link, and what of the swarm
-lies outside them in how many frames.
+"""Coverage of a radar: ranges, velocities and angles link by link, and what of the swarm lies
+outside them in how many frames.
 
 A receiver's maps hold N/2 range cells, or all N of a plain radar. What lies within them arrives in
 every chirp, whatever its data symbol; half a cell farther a passive terminal finds no line of sight
@@ -30,7 +30,7 @@ MOST_FRAMES = 1_000
 
 @dataclass(frozen=True, kw_only=True)
 class LinkCoverage:
-    """What one link's receiver can see.
+    """Coverage of one link's receiver.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ def coverage(
     receivers: Receivers,
     schedule: str,
 ) -> Coverage:
-    """What every link of a run can see, and what of the swarm it cannot.
+    """Return the coverage of every link of a run, and the part of the swarm outside it.
 
     Parameters
     ----------

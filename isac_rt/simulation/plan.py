@@ -191,8 +191,8 @@ class Plan:
         return self.amplitude**2 * self.waveform.num_samples * self.waveform.num_chirps
 
     def chosen(self, paths: PathSet, noise_power: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """Which paths are heard and which of them are too weak, (K,) bool each, and the most that a
-        range cell loses over the noise."""
+        """Mark the paths that are received and those that are too weak, (K,) bool each; return also
+        the most that a range cell loses over the noise."""
         over_noise = paths.power * self.cell_noise_gain() / noise_power
         everything = self.preset == "everything"
         heard = (
@@ -206,7 +206,7 @@ class Plan:
         return heard, weak, left_out
 
     def apply(self, paths: PathSet, noise_power: float) -> tuple[PathSet, Use]:
-        """What a link's frame needs of its paths.
+        """Select what a link's frame needs of its paths.
 
         Parameters
         ----------
@@ -364,7 +364,7 @@ def _highest(waveform: Waveform) -> float:
 
 
 def decisions(plan: Plan) -> dict[str, Any]:
-    """What is fixed before a run: the same in `isac-rt plan` and in summary.json."""
+    """Return what is fixed before a run: the same in `isac-rt plan` and in summary.json."""
     everything = plan.preset == "everything"
     return {
         "preset": plan.preset,
@@ -379,7 +379,7 @@ def decisions(plan: Plan) -> dict[str, Any]:
 
 
 def mechanisms(p: Propagation, c: Clutter) -> dict[str, Any]:
-    """What is modelled of propagation and clutter, as the scenario says."""
+    """List the modelled mechanisms of propagation and clutter, as the scenario says."""
     traced = p.model == "ray_traced"
     return {
         "propagation": p.model,
@@ -394,7 +394,7 @@ def mechanisms(p: Propagation, c: Clutter) -> dict[str, Any]:
 
 
 def extent(city: CityMesh, census: Census, clutter: Clutter) -> dict[str, Any]:
-    """How much of the city and of its clutter takes part: the same in `isac-rt plan` and in
+    """Return how much of the city and of its clutter takes part: the same in `isac-rt plan` and in
     summary.json.
 
     Returns

@@ -1,5 +1,5 @@
-"""What is looked at before a run begins: whether it fits into memory, whether its bodies keep apart
-and out of the city, and whether they can be seen."""
+"""Checks before a run begins: whether it fits into memory, whether its UAVs keep apart and out of
+the city, and whether they can be seen."""
 
 from __future__ import annotations
 

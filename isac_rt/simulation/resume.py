@@ -95,7 +95,7 @@ def _in_use(place: Path) -> ResumeError:
 
 
 def _is_locked(problem: BaseException) -> bool:
-    """Whether another process has a database open for writing."""
+    """Return whether another process has a database open for writing."""
     code = getattr(problem, "sqlite_errorcode", None)
     return code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
 
@@ -117,7 +117,7 @@ class Resume:
 
     @property
     def begun(self) -> bool:
-        """Whether frames of this very run are kept."""
+        """Return whether frames of this very run are kept."""
         return self._owner() == self._digest
 
     def check(self) -> None:
@@ -136,7 +136,7 @@ class Resume:
             )
 
     def entries(self) -> Iterator[Any]:
-        """What an earlier call of this run kept, in its order.
+        """Yield what an earlier call of this run kept, in its order.
 
         Raises
         ------
@@ -166,7 +166,7 @@ class Resume:
             ) from problem
 
     def due(self) -> bool:
-        """Whether it is time for an entry."""
+        """Return whether it is time for an entry."""
         return time.monotonic() - self._last >= self._every
 
     def append(self, entry: Any) -> bool:

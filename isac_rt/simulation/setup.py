@@ -150,8 +150,8 @@ class Frame:
         return self._setup.calibrated(self.samples(link))
 
     def _arriving(self, link: Link) -> list[tuple[Transmission, PathSet]]:
-        """What reaches a link's receiver, its own transmitter's first; antennas that send at once
-        one by one."""
+        """Return the signals at a link's receiver, its own transmitter's first; antennas that send
+        at once one by one."""
         if link not in self.paths:
             received = ", ".join(map(str, self.paths))
             raise ValueError(f"{link} is not received in frame {self.number}; there are {received}")
@@ -177,7 +177,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Setup:
-    """What stays the same over a run: `prepare` makes it.
+    """Parts of a run that stay the same over all frames: `prepare` makes it.
 
     Examples
     --------
@@ -246,7 +246,7 @@ class Setup:
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """Of the terminals' boards, as `radio.calibration` names it.
+        """Return the calibration of the terminals' boards that `radio.calibration` names.
 
         Raises
         ------
@@ -271,7 +271,7 @@ class Setup:
         return Walls(self.city.without(self.scenario.belief.missing_m))
 
     def believed(self, pose: Pose) -> Pose:
-        """What a terminal believes of its pose."""
+        """Return the pose that a terminal believes to have."""
         belief = self.scenario.belief
         if belief == Belief():
             return pose
@@ -285,13 +285,13 @@ class Setup:
 
     @property
     def mistakes(self) -> Mistakes:
-        """What terminals believe wrongly of the clutter beside their pose."""
+        """Return the terminals' errors about the clutter, their pose excluded."""
         belief = self.scenario.belief
         return Mistakes(level_db=belief.level_db, mesh_std=belief.mesh_m, seed=self.scenario.seed)
 
     @cached_property
     def coverage(self) -> Coverage:
-        """What the links can see, and what of the swarm they cannot."""
+        """Return the coverage of the links, and the part of the swarm outside it."""
         s = self.scenario
         return coverage(self.swarm, self.timetable, self.antennas, s.receivers, s.schedule)
 
@@ -341,8 +341,8 @@ class Setup:
     def transmission(
         self, active: str, frame: int, pose: Pose, schedule: Schedule | None = None
     ) -> Transmission:
-        """What an active terminal sends in a frame, by another `schedule` than the usual one if
-        there is one."""
+        """Return what an active terminal sends in a frame, by another `schedule` than the usual one
+        if there is one."""
         return Transmission(
             name=active,
             pose=pose,
@@ -465,7 +465,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
 def _maker(
     scenario: Scenario, plan: Plan, free: FreeSpace, city: CityMesh, floor: NoiseFloor | None
 ) -> Callable[[], Propagation]:
-    """What makes the propagation model of a run."""
+    """Return the factory of a run's propagation model."""
     settings = scenario.propagation, scenario.clutter
     ground = Ground(*settings, plan.swarm, city, plan.waveform, free, plan.max_untraced, floor)
     return partial(make_propagation, ground)
@@ -498,8 +498,8 @@ def _noise_power(
 
 
 def noise_floor(scenario: Scenario, plan: Plan, reference: FreeSpace) -> NoiseFloor | None:
-    """What noise covers of each link's clutter; None where scatterers are not to be merged: links
-    that are found out in the run, mirrors, which bring clutter to other cells, and the preset
+    """Return the noise that covers each link's clutter; None where scatterers are not to be merged:
+    links that are found out in the run, mirrors, which bring clutter to other cells, and the preset
     everything."""
     clutter, timetable = scenario.clutter, plan.timetable
     wanted = clutter.model == "field" and scenario.propagation.model == "ray_traced"
@@ -511,7 +511,7 @@ def noise_floor(scenario: Scenario, plan: Plan, reference: FreeSpace) -> NoiseFl
 def _floor_of(
     scenario: Scenario, plan: Plan, reference: FreeSpace, links: list[Link]
 ) -> NoiseFloor:
-    """What noise covers of some links' clutter."""
+    """Return the noise that covers some links' clutter."""
     timetable, frames = plan.timetable, plan.spread_frames()
     times = np.array([timetable.epoch(frame) for frame in frames])
     poses = [plan.swarm.poses(time) for time in times]
@@ -548,7 +548,7 @@ def timetable_of(scenario: Scenario, waveform: Waveform, schedule: Schedule) -> 
 
 
 def plan_of(scenario: Scenario, antennas: Antennas, timetable: Timetable, swarm: Swarm) -> Plan:
-    """What a scenario asks to be modelled."""
+    """Return what a scenario asks to be modelled."""
     return Plan(
         scenario.accuracy,
         scenario.propagation,

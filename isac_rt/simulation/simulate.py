@@ -182,8 +182,8 @@ class _Observer:
                 self.terminal.shorten(answer.cells, s.swarm.trajectories[self.link.rx].pose(when))
 
     def memory(self, carried: dict[str, Any] | None) -> dict[str, Any]:
-        """What is carried over to the next frame as plain numbers and arrays, for `restore`;
-        `carried` is the terminal's part of it where that is at work on a later frame."""
+        """Return the state carried over to the next frame as plain numbers and arrays, for
+        `restore`; `carried` is the terminal's part of it where that is at work on a later frame."""
         return {
             "terminal": self.terminal.memory() if carried is None else carried,
             "scorer": self.scorer.memory(),
@@ -204,7 +204,7 @@ class _Observer:
 
 
 class _Swarm:
-    """What the terminals of a set of receivers tell each other, with its score."""
+    """Exchange between the terminals of a set of receivers, with its score."""
 
     def __init__(self, setup: Setup) -> None:
         self._swarm = setup.swarm
@@ -229,7 +229,8 @@ class _Swarm:
         return self._cooperation.told(link, frame, time)
 
     def memory(self) -> dict[str, Any]:
-        """What is carried over to the next frame as plain numbers and arrays, for `restore`."""
+        """Return the state carried over to the next frame as plain numbers and arrays, for
+        `restore`."""
         return {"talk": self._cooperation.memory(), "scorer": self._scorer.memory()}
 
     def restore(self, memory: Mapping[str, Any]) -> None:
@@ -263,7 +264,7 @@ class _Listeners:
         )
 
     def told(self, link: Link, frame: int) -> list[KnownBody]:
-        """What the link's receiver knows of from others in a frame: what it knew `AHEAD` frames
+        """Return what the link's receiver knows from others in a frame: what it knew `AHEAD` frames
         before, so that no frame waits for the one before."""
         when = self.recorder.timetable.epoch(frame, link.tx)
         return self.swarm.told(link, frame - AHEAD, when) if self.swarm else []
@@ -438,7 +439,7 @@ class _Run:
 
     @property
     def recorder(self) -> Recorder:
-        """Of the scenario's own receivers."""
+        """Recorder of the scenario's own receivers."""
         return self.own.recorder
 
     @property
@@ -500,8 +501,8 @@ class _Run:
         told: Sequence[Sequence[KnownBody]],
         before: Future[Any] | None,
     ) -> list[Heard]:
-        """What a link's receivers make of a frame, those of the scenario first; all are given the
-        same samples, and each what it was told.
+        """Process a frame with a link's receivers, those of the scenario first; all get the same
+        samples, and each its own reports.
 
         What was `before` at this link is a job that the pool began earlier, so that waiting for it
         ends.
@@ -517,8 +518,8 @@ class _Run:
             return [heard, *(s.observers[link].hear(frame, cube, False, k) for s, k in others)]
 
     def carried(self, link: Link, before: Future[Any] | None) -> list[dict[str, Any]]:
-        """What the terminals of a link, those of the scenario first, carry over from their jobs
-        `before` this one, which the pool began earlier."""
+        """Return what the terminals of a link, those of the scenario first, carry over from their
+        jobs `before` this one, which the pool began earlier."""
         if before is not None:
             before.result()
         return deepcopy([one.observers[link].terminal.memory() for one in self.sets])
@@ -551,8 +552,9 @@ class _Run:
             self.schedules.take_advice({link: h.reception for link, h in heard.items()})
 
     def memory(self, carried: Sequence[Mapping[Link, dict[str, Any]]]) -> dict[str, Any]:
-        """What a later call needs to go on after the frames so far: those since the last entry,
-        and all that receivers carry over, of each set of them that which is `carried` already.
+        """Return what a later call needs to go on after the frames so far: those since the last
+        entry, and all that receivers carry over, of each set of them that which is `carried`
+        already.
 
         Paths and samples are functions of the frame alone and are made anew.
         """

@@ -13,7 +13,7 @@ from isac_rt.results.recorder import STAGES
 
 
 class Seconds(NamedTuple):
-    """Of one stretch of work.
+    """Duration of one stretch of work.
 
     Attributes
     ----------

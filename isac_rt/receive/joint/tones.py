@@ -109,7 +109,7 @@ class Tones(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """How sums over a chirp are added up.
+    """Summation weights over a chirp.
 
     Attributes
     ----------
