@@ -28,5 +28,4 @@ napoleon_google_docstring = False
 napoleon_use_ivar = True
 html_theme = "furo"
 html_title = "isac_rt"
-html_static_path = ["generated/views"]
 suppress_warnings = ["config.cache"]

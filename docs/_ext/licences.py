@@ -1,5 +1,4 @@
-"""Writes docs/generated/licences.md from the lock and what the installed packages say of
-themselves."""
+"""Fills the page `licences.md` from the lock and the metadata of the installed packages."""
 
 from __future__ import annotations
 
@@ -35,15 +34,16 @@ def licence(name: str) -> str | None:
     return "; ".join(stated) or str(data.get("License") or "not stated").splitlines()[0][:60]
 
 
-def write(app: Any) -> None:
+def fill(app: Any, name: str, source: list[str]) -> None:
+    """Put the table in place of the text of `licences.md`."""
+    if name != "licences":
+        return
     lock = (Path(app.srcdir).parent / "requirements.lock").read_text(encoding="utf-8")
     names = dict.fromkeys(re.findall(r"^([A-Za-z0-9_.-]+)==", lock, re.MULTILINE))
     rows = [f"| {name} | {found} |" for name in names if (found := licence(name)) is not None]
-    folder = Path(app.srcdir) / "generated"
-    folder.mkdir(exist_ok=True)
-    (folder / "licences.md").write_text(HEAD + "\n".join(rows) + "\n", encoding="utf-8")
+    source[0] = HEAD + "\n".join(rows) + "\n"
 
 
 def setup(app: Any) -> dict[str, bool]:
-    app.connect("builder-inited", write)
+    app.connect("source-read", fill)
     return {"parallel_read_safe": True}

@@ -1,7 +1,8 @@
-"""The notebooks as pages: what `make notebooks` wrote, with its pictures and its views to turn."""
+"""Fills the pages `notebooks/NAME.md` with the notebooks that `make notebooks` ran."""
 
 from __future__ import annotations
 
+import base64
 from pathlib import Path
 from typing import Any
 
@@ -13,38 +14,52 @@ PLOTLY = "application/vnd.plotly.v1+json"
 ROOT = Path(__file__).parents[2]
 
 
-def with_frames(notebook: nbformat.NotebookNode, stem: str, views: Path) -> None:
-    """Put a page of its own into ``views`` for each plotly figure, and a frame in its place."""
+def take_out_views(notebook: nbformat.NotebookNode, stem: str) -> dict[str, dict]:
+    """Replace each plotly figure by a frame that shows a page; return the figures by page."""
+    views = {}
     for k, cell in enumerate(notebook.cells):
         for output in cell.get("outputs", []):
             figure = output.get("data", {}).pop(PLOTLY, None)
             if figure is None:
                 continue
             figure.pop("config", None)
-            page = views / f"{stem}_{k}.html"
-            plotly.io.write_html(figure, page, include_plotlyjs="directory", validate=False)
+            page = f"{stem}_{k}.html"
+            views[page] = figure
             output.data.clear()
             output.data["text/markdown"] = (
-                f'<iframe src="../../_static/{page.name}" width="100%" height="520"></iframe>'
+                f'<iframe src="../_static/{page}" width="100%" height="520"></iframe>'
             )
+    return views
 
 
-def write(app: Any) -> None:
-    """Write ``generated/notebooks/NAME.md``, its pictures, and ``generated/views``."""
-    folder = Path(app.srcdir) / "generated" / "notebooks"
-    folder.mkdir(parents=True, exist_ok=True)
+def fill(app: Any, name: str, source: list[str]) -> None:
+    """Put a notebook's Markdown in place of its page's text, with its pictures inside."""
+    folder, _, stem = name.rpartition("/")
+    if folder != "notebooks":
+        return
+    notebook = nbformat.read(ROOT / "notebooks" / f"{stem}.ipynb", as_version=4)
+    take_out_views(notebook, stem)
+    exporter = MarkdownExporter(exclude_input_prompt=True, exclude_output_prompt=True)
+    text, resources = exporter.from_notebook_node(notebook, resources={"unique_key": stem})
+    for picture, data in resources["outputs"].items():
+        encoded = base64.b64encode(data).decode("ascii")
+        text = text.replace(f"({picture})", f"(data:image/png;base64,{encoded})")
+    source[0] = text
+
+
+def write_views(app: Any, error: Exception | None) -> None:
+    """Write the pages that the frames show into the site."""
+    if error is not None or app.builder.format != "html":
+        return
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
-        notebook = nbformat.read(path, as_version=4)
-        with_frames(notebook, path.stem, Path(app.srcdir) / "generated" / "views")
-        exporter = MarkdownExporter(exclude_input_prompt=True, exclude_output_prompt=True)
-        text, resources = exporter.from_notebook_node(notebook, resources={"unique_key": path.stem})
-        (folder / f"{path.stem}.md").write_text(text, encoding="utf-8")
-        for name, data in resources["outputs"].items():
-            (folder / name).write_bytes(data)
+        views = take_out_views(nbformat.read(path, as_version=4), path.stem)
+        for page, figure in views.items():
+            out = Path(app.outdir) / "_static" / page
+            plotly.io.write_html(figure, out, include_plotlyjs="directory", validate=False)
 
 
 def setup(app: Any) -> dict[str, bool]:
     """Called by Sphinx."""
-    (Path(app.srcdir) / "generated" / "views").mkdir(parents=True, exist_ok=True)
-    app.connect("builder-inited", write)
+    app.connect("source-read", fill)
+    app.connect("build-finished", write_views)
     return {"parallel_read_safe": True}

@@ -1,15 +1,14 @@
-"""Writes docs/generated/scenario.md, the reference of every scenario key, from the schema."""
+"""Fills the page `scenario.md`, the reference of every scenario key, from the schema."""
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 HEAD = """# Scenario reference
 
-Every key of a scenario, as `isac-rt schema` has it. Units stand in the names;
-a key without a default must be given.
+Every key of a scenario, from the schema that `isac-rt schema` prints. A key's name ends in its
+unit; a key without a default must be given.
 """
 
 
@@ -67,14 +66,20 @@ def reference(schema: dict[str, Any]) -> str:
     return "\n".join(parts) + "\n"
 
 
-def write(app: Any) -> None:
-    from isac_rt.scenario.tree import json_schema
+def fill(app: Any, name: str, source: list[str]) -> None:
+    """Put the reference in place of the text of `scenario.md`."""
+    if name == "scenario":
+        from isac_rt.scenario.tree import json_schema
 
-    folder = Path(app.srcdir) / "generated"
-    folder.mkdir(exist_ok=True)
-    (folder / "scenario.md").write_text(reference(json_schema()), encoding="utf-8")
+        source[0] = reference(json_schema())
+
+
+def outdated(app: Any, env: Any, added: set, changed: set, removed: set) -> list[str]:
+    """Return the page, which is written anew by every build: the schema may have changed."""
+    return ["scenario"]
 
 
 def setup(app: Any) -> dict[str, bool]:
-    app.connect("builder-inited", write)
+    app.connect("source-read", fill)
+    app.connect("env-get-outdated", outdated)
     return {"parallel_read_safe": True}
