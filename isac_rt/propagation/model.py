@@ -30,12 +30,14 @@ class Census:
         not named are all
     mirrors : by terminal the number of its mirrors, the share of its power that they send on and
         the share that all others would
+    overlap_m2 : area in sight that lies in two surfaces or more, and scatters once
     """
 
     scatterers: int | None = None
     scatterer_cells: int | None = None
     merged: dict[str, int] | None = None
     mirrors: dict[str, dict[str, float]] | None = None
+    overlap_m2: float | None = None
 
 
 class Propagation(Protocol):

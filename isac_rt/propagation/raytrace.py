@@ -152,6 +152,7 @@ class RayTracer:
             self.field.num_candidates,
             {str(link): len(some.cells) for link, some in self.field.merged.items()},
             None if self.two_bounces is None else self.two_bounces.census(),
+            round(self.field.overlap, 1),
         )
 
     def by_half(self, which: int) -> RayTracer:

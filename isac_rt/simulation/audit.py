@@ -242,7 +242,8 @@ def _scene_items(setup: Setup) -> list[Item]:
         hidden = record["scatterer_cells"] - count
         density = f"{record['cell_area_per_metre_m']:.3g} m2 and metre from the flights"
         said, why = f"{count} scatterers, one for {density}", "cells that no transmitter sees"
-        error = record["clutter_error_db"]
+        error, again = record["clutter_error_db"], record["overlap_m2"]
+        why += f"; {again:.0f} m2 that lie twice, for surfaces overlap" if again else ""
         out.append(Item("clutter field", said, f"{hidden} {why}", error, "dB of a cell's mean"))
         for link, left in record["merged"].items():
             covered = f"{count - left} merged under noise or out of sight"

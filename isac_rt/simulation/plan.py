@@ -404,7 +404,8 @@ def extent(city: CityMesh, census: Census, clutter: Clutter) -> dict[str, Any]:
         (`Plan.mesh_radius`); scatterers in sight of a transmitter, None without a field, cells of
         the whole mesh among which they were, and by link what is left of them where noise covers
         the rest; by terminal the mirrors of two-bounce clutter and
-        the shares of its power that they and all others send on, None without mirrors
+        the shares of its power that they and all others send on, None without mirrors; area in
+        sight that lies in two surfaces [m^2]
     """
     area = Density.of(clutter).per_metre if clutter.model == "field" else None
     return {

@@ -47,6 +47,7 @@ from isac_rt.kernels.jit import twin_of
 from isac_rt.plain import plain
 from isac_rt.propagation.clutter.cells import MOST_CELLS, Cells, Density, cut, error_for
 from isac_rt.propagation.clutter.merging import Heard, NoiseFloor, covered, resolution_cell
+from isac_rt.propagation.clutter.overlaps import lies_twice
 from isac_rt.propagation.clutter.penumbra import Facets
 from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight, Sight, ever_ahead
 from isac_rt.propagation.legs.bodies import Bodies
@@ -219,6 +220,7 @@ class ClutterField:
         sight: Sight,
         wavelength: float,
         num_candidates: int,
+        overlap: float,
         merged: Mapping[Link, Scatterers] | None = None,
     ) -> None:
         self._city, self.sight = city, sight
@@ -226,6 +228,8 @@ class ClutterField:
         self.merged = merged or {}
         self.num_candidates = num_candidates
         """Cells of the whole city, those that are never in sight included."""
+        self.overlap = overlap
+        """Area in sight that lies in two surfaces or more, and scatters once [m^2]."""
         self.surfaces = surfaces(city, wavelength)
         self._wavelength, self._scale = wavelength, wavelength / (4 * np.pi)
 
@@ -267,13 +271,15 @@ class ClutterField:
                 return out
 
             cells = cut(city, scatters, places, density, seed, in_sight)
-            return {"cells": vars(cells), "of": of}
+            twice = lies_twice(cells, city)
+            again = float(cells.area[twice].sum())
+            return {"cells": vars(cells.select(~twice)), "of": of, "overlap": again}
 
         depends_on = [plain(city), places, lookouts, fronts, asdict(density), seed, MOST_CELLS]
         had = kept("cells", [*depends_on, mi.variant()], found)
         cells = Cells(**had["cells"])
         sight = Sight(shadows, flights, facets_of(cells, city), wavelength, city)
-        field = cls(city, cells, sight, wavelength, had["of"])
+        field = cls(city, cells, sight, wavelength, had["of"], had["overlap"])
         if floor is None:
             return field
         poses = {
@@ -300,8 +306,8 @@ class ClutterField:
         return self._with({})
 
     def _with(self, merged: Mapping[Link, Scatterers]) -> ClutterField:
-        whole = self._city, self.cells, self.sight, self._wavelength, self.num_candidates
-        return ClutterField(*whole, merged)
+        whole = self._city, self.cells, self.sight, self._wavelength
+        return ClutterField(*whole, self.num_candidates, self.overlap, merged)
 
     def _own(self, link: Link, cells: Cells) -> Scatterers:
         """Cells that a link alone sees."""
