@@ -58,10 +58,13 @@ def _cut_face(at, leaves, waiting, line, spans, places, boxes, density, most):
     row, state, count, first, last = at
     rows, codes, areas, states, points = leaves
     line_codes, line_areas = waiting
-    per_metre, smallest, near = density
+    per_metre, smallest, near, farthest = density
     end = line_areas.size
     while first < last <= end - 2 and count < rows.size and count + last - first <= most:
         size = line_areas[first]
+        if _beyond(line[first], farthest):
+            first += 1
+            continue
         reach = size / per_metre if size > smallest else 0.0
         if FINER * size > smallest:
             reach = max(reach, min(FINER * size / per_metre, near))
@@ -126,6 +129,16 @@ def _near(corners, limit, places, boxes, span):
             least = min(least, _square(places[k, 0] - x, places[k, 1] - y, places[k, 2] - z))
     span[0] = span[1] = np.sqrt(least)
     return max(span[0] - reach, 0.0) < limit
+
+
+@jit(borrows=True)
+def _beyond(corners, far):
+    """Return whether a triangle (3, 3) lies outside the cube of half the side `far`."""
+    for k in range(3):
+        a, b, c = corners[0, k], corners[1, k], corners[2, k]
+        if min(a, b, c) > far or max(a, b, c) < -far:
+            return True
+    return False
 
 
 @jit(inline=True)

@@ -141,9 +141,9 @@ class City(Node):
     """Number of blocks from south to north, for `blocks`, as `blocks_x` from west to east. By
     default as many."""
     keep_radius_m: Positive | None = None
-    """Horizontal distance from the middle of the flight within which the city is kept [m]. A
-    smaller city is traced faster, but what is left out neither reflects nor shadows. By default all
-    of it is kept."""
+    """Distance from the middle of the flight within which the city is kept [m]. A smaller city is
+    traced faster, but what is left out neither reflects nor shadows; a face that reaches beyond
+    stays, and scatters nothing there. By default all of it is kept."""
     materials: dict[str, MaterialOverride] = Field({})
     """Properties to change, by the name of the material. By default the table of ITU-R P.2040
     holds."""

@@ -32,7 +32,7 @@ from isac_rt.receive.directions import searches
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.simulation.setup import propagation_in, swarm_of
-from isac_rt.world.city import CityMesh, Material, load_city
+from isac_rt.world.city import CityError, CityMesh, Material, load_city
 from isac_rt.world.swarm import Pose
 
 C, F_C, EPS_0 = 299_792_458.0, 77e9, 8.8541878128e-12
@@ -148,8 +148,26 @@ def test_one_cell_too_many_is_refused(monkeypatch):
     monkeypatch.setattr(clutter_cells, "MOST_CELLS", count)
     assert len(all_cells(canyon())) == count
     monkeypatch.setattr(clutter_cells, "MOST_CELLS", count - 1)
-    with pytest.raises(ValueError, match=f"more than {count - 1} cells"):
+    with pytest.raises(CityError, match=f"more than {count - 1} cells"):
         all_cells(canyon())
+
+
+def test_faces_are_cut_to_the_reach():
+    """A ground of 40 km under a canyon has cells as far as the city matters and no farther; it
+    broke the clutter. Nearer ones are what they are without a reach. Planted bug: a cell on the far
+    side of the origin stays."""
+    ground = 2e4 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    wide = CityMesh("wide", ground, faces, np.zeros(2, np.int16), (), np.zeros(3)).within(312.7)
+    cells = cut(wide, np.ones(2, bool), PLACES, DENSITY, 3)
+    assert cells.area.sum() == pytest.approx((2 * 312.7) ** 2, rel=0.05)
+    assert np.abs(cells.points).max() < 312.7 + 10
+    city = canyon()
+    near = cut(replace(city, reach=30.3), np.ones(city.num_faces, bool), PLACES, DENSITY, 3)
+    every = cut(city, np.ones(city.num_faces, bool), PLACES, DENSITY, 3)
+    inside = np.abs(every.points).max(axis=1) < 30.3
+    assert set(every.code[inside]) <= set(near.code)
+    assert 0 < len(near) < len(every)
 
 
 @pytest.mark.parametrize("seed", [5, 6])

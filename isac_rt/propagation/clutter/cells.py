@@ -19,6 +19,7 @@ from isac_rt.kernels.propagation_cells import BOX, FINER
 from isac_rt.kernels.propagation_cells import leaves as _leaves
 from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import seed_sequence, splitmix64
+from isac_rt.world.city.materials import CityError
 from isac_rt.world.city.mesh import CityMesh
 
 UNIT = 1e-6 * np.sqrt(2)
@@ -137,7 +138,7 @@ def cut(
 
     Raises
     ------
-    ValueError  If there would be more than `MOST_CELLS`.
+    CityError  If there would be more than `MOST_CELLS`.
     """
     face = np.flatnonzero(scattering)
     corners = _sorted_corners(city.corners[face])
@@ -147,11 +148,11 @@ def cut(
         (corners, city.areas[face], _face_state(corners + city.origin, seed)),
         places,
         _boxes(places),
-        astuple(density),
+        (*astuple(density), city.reach),
         MOST_CELLS,
     )
     if count > MOST_CELLS:
-        raise ValueError(
+        raise CityError(
             f"a scatterer for every {density.per_metre:g} m2 and metre (clutter.max_error_db, "
             "or cell_area_per_metre_m) cuts "
             f"the city into more than {MOST_CELLS} cells; raise it, or lower city.keep_radius_m"

@@ -68,6 +68,8 @@ class CityMesh:
         Coplanar within this. [m]
     num_beyond : int
         Faces that `within` cut away.
+    reach : float
+        Distance from the origin beyond which faces matter to nothing [m].
     place : Place or None
         Where it lies on Earth, of cities from maps.
     """
@@ -81,6 +83,7 @@ class CityMesh:
     notes: tuple[str, ...] = ()
     plane_tolerance: float = PLANE_TOLERANCE
     num_beyond: int = 0
+    reach: float = np.inf
     place: Place | None = None
 
     def __post_init__(self) -> None:
@@ -160,17 +163,19 @@ class CityMesh:
         return planes
 
     def within(self, radius: float) -> CityMesh:
-        """The faces that come as near to the origin as `radius` [m], whole; this very city if all
-        do."""
+        """The faces that come as near to the origin as `radius` [m], whole; their part beyond it
+        scatters nothing (`reach`)."""
         if not (np.isfinite(radius) and self.num_faces):
             return self
-        near = np.linalg.norm(self.corners, axis=2).min(axis=1) <= radius
+        corner = np.linalg.norm(self.corners, axis=2)
+        if (corner <= radius).all():
+            return self
+        near = corner.min(axis=1) <= radius
         if not near.all():  # few have an edge or a middle nearer than their corners
             near[~near] = distance_to_triangles(self.corners[~near], np.zeros(3)) <= radius
-        if near.all():
-            return self
-        kept = self._of(near)
-        return replace(kept, num_beyond=self.num_beyond + int((~near).sum()))
+        kept = self if near.all() else self._of(near)
+        beyond = self.num_beyond + int((~near).sum())
+        return replace(kept, num_beyond=beyond, reach=min(radius, self.reach))
 
     def without(self, areas: Sequence[tuple[float, float, float, float]]) -> CityMesh:
         """The city but for the faces that lie wholly within one of some rectangles (x_min, y_min,

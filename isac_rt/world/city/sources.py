@@ -187,5 +187,6 @@ def load_city(
         origin,
         tuple(counted),
         tolerance,
+        reach=city.keep_radius_m or np.inf,
         place=parts.place,
     )
