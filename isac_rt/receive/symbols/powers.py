@@ -31,6 +31,10 @@ GATHERED = 0.6
 """Share of the spread of phases that lie anywhere, below which the spread of transitions about
 their symbols is their error: wrapping hides a tenth of it at most."""
 
+PREDICTED_STDS, READABLE_TURN = 3.0, 1 / 3
+"""Deviations of the predicted velocity within which a path moves as predicted, and turn of a mean
+transition [symbols]: beyond it most are wrong."""
+
 
 @dataclass(frozen=True)
 class Symbols:
@@ -39,8 +43,9 @@ class Symbols:
     `confidence` of a delay symbol is its cell's power over the mean of the other cells; of a
     transition, the cosine-like share
     |sum y conj(y')| / sum |y y'|, in [0, 1]. `phase_spread` is the RMS distance of the transitions
-    from their symbols [rad]. `looks` receivers are added in power. `soft_bits` are the bits'
-    log-likelihood ratios ln P(0)/P(1), from beams only.
+    from their symbols [rad], `least_spread` the least that it is for any velocity within
+    `PREDICTED_STDS` deviations of the predicted one; None: the same. `looks` receivers are added in
+    power. `soft_bits` are the bits' log-likelihood ratios ln P(0)/P(1), from beams only.
     """
 
     raw: np.ndarray
@@ -53,6 +58,7 @@ class Symbols:
     bits: np.ndarray
     looks: int
     soft_bits: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    least_spread: float | None = None
 
 
 @lru_cache(maxsize=64)
@@ -119,7 +125,10 @@ def demodulate(
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)
     known = known_cycles(w, delays[0], rates[0], raw)
     picked *= np.exp(-2j * np.pi * known)[:, None, :]
-    transitions, share, spread = decide_transitions(picked, cube.schedule, w.num_tx, dpsk_order)
+    summed, share = transition_sums(picked, cube.schedule, w.num_tx)
+    transitions, spread = nearest_symbols(summed, dpsk_order)
+    times = by_antenna(w.middle_time + raw * w.delay_step, cube.schedule, w.num_tx)
+    far = PREDICTED_STDS * prediction.velocity_std[0] / SPEED_OF_LIGHT * w.effective_carrier
     return Symbols(
         raw=raw,
         delay=delay,
@@ -130,6 +139,7 @@ def demodulate(
         phases=running_phases(transitions, cube.schedule, dpsk_order),
         bits=demodulate_bits(delay, transitions, w, dpsk_order),
         looks=cube.samples.shape[1],
+        least_spread=least_spread(summed, np.diff(times, axis=-1), far, dpsk_order),
     )
 
 
@@ -178,16 +188,23 @@ def decide(
     return cells[best], peak / np.maximum(rest, 1e-300)
 
 
-def decide_transitions(
-    picked: np.ndarray, schedule: np.ndarray, num_tx: int, order: int
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Transitions of each antenna's consecutive chirps, summed over receivers with the conjugate of
-    the earlier one."""
+def transition_sums(
+    picked: np.ndarray, schedule: np.ndarray, num_tx: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Products of each antenna's consecutive chirps with the conjugate of the earlier one, summed
+    over receivers, (M, L_tx, P/L_tx - 1), and the share of the aligned sum that they reach."""
     chains = by_antenna(picked, schedule, num_tx)  # M, L_tx, L_rx, P/L_tx
     product = chains[..., 1:] * chains[..., :-1].conj()
     summed = product.sum(axis=2)
+    return summed, np.abs(summed) / np.maximum(np.abs(product).sum(axis=2), 1e-300)
+
+
+def decide_transitions(
+    picked: np.ndarray, schedule: np.ndarray, num_tx: int, order: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """DPSK symbols of `transition_sums`, their shares and their `phase_spread`."""
+    summed, share = transition_sums(picked, schedule, num_tx)
     symbols, spread = nearest_symbols(summed, order)
-    share = np.abs(summed) / np.maximum(np.abs(product).sum(axis=2), 1e-300)
     return symbols, share, spread
 
 
@@ -198,16 +215,31 @@ def nearest_symbols(summed: np.ndarray, order: int) -> tuple[np.ndarray, float]:
     return np.round(steps).astype(np.int64) % order, float(spread)
 
 
+def least_spread(summed: np.ndarray, length: np.ndarray, far: float, order: int) -> float:
+    """Return the least `phase_spread` of `transition_sums`, `length` apart in time [s], of all
+    errors of the Doppler frequency up to `far` [Hz], and to `READABLE_TURN`."""
+    phase, turns = np.angle(summed), 2 * np.pi * length
+    far = min(far, READABLE_TURN / (order * float(length.mean())))
+    # neighbouring errors turn the longest transition by a fifth of a symbol
+    steps = int(np.ceil(far * length.max() * order / 0.2))
+    errors = np.linspace(-far, far, 2 * steps + 1)
+    off = (phase - np.multiply.outer(errors, turns)) / (2 * np.pi / order)
+    spread = ((off - np.round(off)) ** 2).reshape(errors.size, -1).mean(axis=1)
+    return float(np.sqrt(spread.min()) * 2 * np.pi / order)
+
+
 def moves_as_predicted(symbols: Symbols, order: int) -> bool:
     """Return whether the DPSK phases gather at the symbols, as far as the noise lets this be seen.
 
     The delay decisions take whatever path is strongest, and the DPSK decisions take up the whole
     symbols of its Doppler, so that a reflection always ends up near the predicted cell. But unless
     it moves as predicted its phases lie anywhere between the symbols: a spread of pi/D/sqrt(3).
+    A path that the prediction allows, within its deviation, moves as predicted.
     """
     anywhere = np.pi / order / np.sqrt(3)
-    from_noise = transition_noise(symbols)
-    return bool(from_noise > 0.6 * anywhere or symbols.phase_spread < 0.8 * anywhere)
+    from_noise, least = transition_noise(symbols), symbols.least_spread
+    spread = symbols.phase_spread if least is None else min(least, symbols.phase_spread)
+    return bool(from_noise > 0.6 * anywhere or spread < 0.8 * anywhere)
 
 
 def transition_noise(symbols: Symbols) -> float:
