@@ -21,6 +21,8 @@ from isac_rt.kernels.vector import (
 )
 
 _NONE = np.float32(0)
+STENCIL = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1], [1, -1], [1, 1]])
+"""Places of a stencil down and across: its middle, the cross, the corners."""
 
 
 class Chirps(NamedTuple):
@@ -158,6 +160,63 @@ def _add_matches(chirps, axis, delays, delay_rates, steps, out, energy):
                 energy[j, tx] += template[2 * LANES + i]
                 to = j * out.shape[1] + tx * line
                 _add_chirp(chirps, first + i, template, i, flat, to)
+
+
+@jit
+def _explained(chirps, axis, delays, delay_rates, antennas):
+    """Return the energies (K,) that templates explain: |match|^2 over the template's energy, summed
+    over antennas and receivers."""
+    line = 2 * LANES * chirps.blocks
+    out = np.zeros((delays.size, antennas * line), np.float32)
+    energy, total = np.zeros((delays.size, antennas)), np.zeros(delays.size)
+    match(chirps, axis, delays, delay_rates, out, energy)
+    for j in range(delays.size):
+        for t in range(antennas):
+            power = 0.0
+            for i in range(t * line, (t + 1) * line):
+                power += np.float64(out[j, i]) ** 2
+            total[j] += power / max(energy[j, t], 1e-30)
+    return total
+
+
+@jit
+def newton(powers, step, mixed):
+    """`isac_rt.receive.estimate.newton`."""
+    g = np.log(np.maximum(powers, 1e-300))
+    gx, gy = (g[2] - g[1]) / (2 * step), (g[4] - g[3]) / (2 * step)
+    hxx = (g[2] - 2 * g[0] + g[1]) / step**2
+    hyy = (g[4] - 2 * g[0] + g[3]) / step**2
+    hxy = (g[8] - g[7] - g[6] + g[5]) / (4 * step**2) if g.size > 5 else mixed
+    det = hxx * hyy - hxy**2
+    down, across = np.copysign(step, gx), np.copysign(step, gy)
+    if hxx < 0 and det > 0:
+        down, across = (hyy * gx - hxy * gy) / -det, (hxx * gy - hxy * gx) / -det
+    most = 3 * step
+    return min(max(down, -most), most), min(max(across, -most), most), hxy
+
+
+@jit
+def estimate(spectra, chirps, axis, lows, counts, delays, rates, steps, units, out, energy):
+    """`isac_rt.receive.estimate.estimate`, all peaks in the memory of `chirps`."""
+    data, _, blocks, weight, time, tx, tile = chirps
+    carrier, slope, middle, duration, length, share, _ = axis
+    delay_unit, rate_unit, coupling = units
+    for q in range(lows.size):
+        here = Chirps(data, counts[q], blocks, weight, time, tx, tile)
+        gather(spectra, lows[q], share, here)
+        about = WindowAxis(carrier, slope, middle, duration, length, share, np.float64(lows[q]))
+        doppler, mixed = rates[q] / rate_unit, 0.0
+        beat = delays[q] / delay_unit + doppler * coupling
+        for number in range(steps.size):
+            step, stencil = steps[number], STENCIL[: 5 if number else len(STENCIL)]
+            across = doppler + step * stencil[:, 1]
+            taus = (beat + step * stencil[:, 0] - across * coupling) * delay_unit
+            powers = _explained(here, about, taus, across * rate_unit, energy.shape[1])
+            down, up, mixed = newton(powers, step, mixed)
+            beat, doppler = beat + down, doppler + up
+        delays[q], rates[q] = (beat - doppler * coupling) * delay_unit, doppler * rate_unit
+        one = slice(q, q + 1)
+        match(here, about, delays[one], rates[one], out[one], energy[one])
 
 
 @jit

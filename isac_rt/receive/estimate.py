@@ -15,7 +15,7 @@ of it is linearised in the frame.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple, TypeVar
@@ -27,7 +27,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels import receive_directions, receive_estimate
 from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.receive_directions import TIE
-from isac_rt.kernels.receive_estimate import Chirps, WindowAxis
+from isac_rt.kernels.receive_estimate import STENCIL, Chirps, WindowAxis
 from isac_rt.kernels.vector import LANES, aligned, unset
 from isac_rt.receive import planar
 from isac_rt.receive.arms import arm, element_delays
@@ -39,8 +39,6 @@ from isac_rt.receive.modes import MODES, mode_shapes
 HALF_WIDTH = 3
 STENCILS = 0.2, 0.08, 0.03
 """Half widths of the stencils on which a peak of the likelihood is fitted [cells, bins]."""
-_STENCIL = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1], [1, -1], [1, 1]])
-"""Places of a stencil down and across: its middle, the cross, the corners."""
 PULL = 1.0
 """Distance of another path in the cell [cells, bins]."""
 T = TypeVar("T", float, np.ndarray)
@@ -91,8 +89,7 @@ class LocalSpectra:
         receivers, and over the transmit antennas in phase or in power."""
         self.waveform, self._sent = known.waveform, _sent(known, separate)
         self._beam, self._in_phase = beam, in_phase
-        low = max(row - HALF_WIDTH, 0)
-        count = min(row + HALF_WIDTH + 1, spectra.shape[2]) - low
+        low, count = _rows_about(row, spectra.shape[2])
         self._axis = _axis(known.waveform)._replace(first=float(low))
         self._num_rx = spectra.shape[1]
         self._chirps = _room(self._sent, self._num_rx, count)
@@ -105,20 +102,14 @@ class LocalSpectra:
         out = np.zeros((delays.size, size * blocks * 2 * LANES), np.float32)
         energy = np.zeros((delays.size, size))
         match(self._chirps, self._axis, delays, delay_rates, out, energy)
-        parts = out.reshape(delays.size, size, blocks, 2, LANES).astype(float)
-        values = (parts[..., 0, :] + 1j * parts[..., 1, :]).reshape(delays.size, size, -1)
-        return values[..., : self._num_rx], np.maximum(energy, 1e-30)
+        return _complex(out, energy, self._num_rx), np.maximum(energy, 1e-30)
 
     def respond(self, delay: float, delay_rate: float) -> np.ndarray:
         """(L_tx, L_rx) matched response, normalised so that a path at (delay, delay_rate) gives its
         amplitude; of separate groups the mean, each antenna turned into the phase that it has in
         the first one."""
         matched, energy = self._matched(np.array([delay]), np.array([delay_rate]))
-        sets = (matched[0] / energy[0, :, None]).reshape(-1, self.waveform.num_tx, self._num_rx)
-        if len(sets) == 1:
-            return sets[0]
-        turn = np.exp(-1j * np.angle((sets * sets[:1].conj()).sum(axis=2, keepdims=True)))
-        return np.asarray((sets * turn).mean(axis=0))
+        return _amplitudes(matched, energy, self.waveform.num_tx)[0]
 
     def modes(self, delay: float, delay_rate: float) -> np.ndarray:
         """(MODES, L_tx, L_rx) amplitudes of a path by polynomials over the chirp: the least squares
@@ -160,19 +151,29 @@ class LocalSpectra:
         return np.asarray((added.real**2 + added.imag**2).sum(axis=1))
 
     def climb(self, delay: float, delay_rate: float, steps: Sequence[float]) -> tuple[float, float]:
-        """As `refine`, in the coordinates beat at mid-frame and Doppler, which decouple; the beat
-        holds the coupling."""
-        delay_unit, rate_unit, coupling = _units(self.waveform)
-        beat = delay / delay_unit + delay_rate / rate_unit * coupling
-        doppler, mixed = delay_rate / rate_unit, 0.0
-        for number, step in enumerate(steps):
-            stencil = _STENCIL[: 5 if number else len(_STENCIL)]
-            across = doppler + step * stencil[:, 1]
-            delays = (beat + step * stencil[:, 0] - across * coupling) * delay_unit
-            powers = self.powers(delays, across * rate_unit)
-            down, up, mixed = _newton(powers, step, mixed)
-            beat, doppler = beat + down, doppler + up
-        return (beat - doppler * coupling) * delay_unit, doppler * rate_unit
+        """Move to the maximum of `powers` by Newton steps on stencils of half widths `steps`."""
+        return _climb(self.powers, delay, delay_rate, steps, _units(self.waveform))
+
+
+def _climb(
+    powers: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    delay: float,
+    delay_rate: float,
+    steps: Iterable[float],
+    units: tuple[float, float, float],
+) -> tuple[float, float]:
+    """Maximise `powers` in the coordinates beat at mid-frame and Doppler, which decouple; the beat
+    holds the coupling."""
+    delay_unit, rate_unit, coupling = units
+    beat = delay / delay_unit + delay_rate / rate_unit * coupling
+    doppler, mixed = delay_rate / rate_unit, 0.0
+    for number, step in enumerate(steps):
+        stencil = STENCIL[: 5 if number else len(STENCIL)]
+        across = doppler + step * stencil[:, 1]
+        delays = (beat + step * stencil[:, 0] - across * coupling) * delay_unit
+        down, up, mixed = newton(powers(delays, across * rate_unit), step, mixed)
+        beat, doppler = beat + down, doppler + up
+    return (beat - doppler * coupling) * delay_unit, doppler * rate_unit
 
 
 class _Sent(NamedTuple):
@@ -194,6 +195,31 @@ def _sent(known: Known, separate: bool) -> _Sent:
     time[:chirps] = known.times.ravel()
     tx = np.ascontiguousarray((known.schedule + own).ravel())
     return _Sent(weight, time, tx, w.num_tx * (w.num_groups if separate else 1))
+
+
+def _rows_about(row: T, num_rows: int) -> tuple[T, T]:
+    """First of the rows that a template at `row` covers, and their number."""
+    low = np.maximum(row - HALF_WIDTH, 0)
+    return low, np.minimum(row + HALF_WIDTH + 1, num_rows) - low
+
+
+def _complex(out: np.ndarray, energy: np.ndarray, num_rx: int) -> np.ndarray:
+    """Complex matches (K, antennas, L_rx) from the `out` of `match`."""
+    blocks = -(-num_rx // LANES)
+    parts = out.reshape(*energy.shape, blocks, 2, LANES).astype(float)
+    values = (parts[..., 0, :] + 1j * parts[..., 1, :]).reshape(*energy.shape, blocks * LANES)
+    return np.asarray(values[..., :num_rx])
+
+
+def _amplitudes(matched: np.ndarray, energy: np.ndarray, num_tx: int) -> np.ndarray:
+    """Responses (K, L_tx, L_rx) from matches (K, antennas, L_rx) and the templates' energies; of
+    separate groups the mean, each antenna turned into the phase that it has in the first one."""
+    values = matched / energy[..., None]
+    sets = values.reshape(len(values), energy.shape[1] // num_tx, num_tx, values.shape[2])
+    if sets.shape[1] == 1:
+        return np.asarray(sets[:, 0])
+    turn = np.exp(-1j * np.angle((sets * sets[:, :1].conj()).sum(axis=3, keepdims=True)))
+    return np.asarray((sets * turn).mean(axis=1))
 
 
 def _room(sent: _Sent, num_rx: int, rows: int) -> Chirps:
@@ -308,7 +334,8 @@ def _units(waveform: Waveform) -> tuple[float, float, float]:
     return w.delay_step, rate, w.sampled_duration / w.frame_duration
 
 
-def _newton(powers: np.ndarray, step: float, mixed: float) -> tuple[float, float, float]:
+@twin_of(receive_estimate.newton)
+def newton(powers: np.ndarray, step: float, mixed: float) -> tuple[float, float, float]:
     """Move down and across to the top of a paraboloid through the logarithms of the powers on a
     stencil of a half width, and its mixed derivative, which a stencil without corners is told: it
     is small in these coordinates, so that what the first says is good enough."""
@@ -325,6 +352,42 @@ def _newton(powers: np.ndarray, step: float, mixed: float) -> tuple[float, float
     return min(max(down, -most), most), min(max(across, -most), most), hxy
 
 
+@twin_of(receive_estimate.estimate)
+def estimate(
+    spectra: np.ndarray,
+    chirps: Chirps,
+    axis: WindowAxis,
+    lows: np.ndarray,
+    counts: np.ndarray,
+    delays: np.ndarray,
+    rates: np.ndarray,
+    steps: np.ndarray,
+    units: tuple[float, float, float],
+    out: np.ndarray,
+    energy: np.ndarray,
+) -> None:
+    """Refine delays and delay rates of peaks (Q,) in place on rows `lows` to `lows + counts`, as
+    `LocalSpectra.climb`, and add the matches there to `out` and `energy` (`match`)."""
+    lanes, num_tx = 2 * LANES * chirps.blocks, energy.shape[1]
+    for q, (low, count) in enumerate(zip(lows.tolist(), counts.tolist(), strict=True)):
+        room = chirps.data[: chirps.tx.size * count * lanes]
+        here, about = chirps._replace(data=room, rows=count), axis._replace(first=float(low))
+        gather(spectra, low, axis.share, here)
+
+        def explained(
+            delays: np.ndarray, rates: np.ndarray, here: Chirps = here, about: WindowAxis = about
+        ) -> np.ndarray:
+            found = np.zeros((len(delays), num_tx * lanes), np.float32)
+            sums = np.zeros((len(delays), num_tx))
+            match(here, about, delays, rates, found, sums)
+            power = (found.reshape(len(delays), num_tx, -1).astype(float) ** 2).sum(axis=2)
+            return np.asarray((power / np.maximum(sums, 1e-30)).sum(axis=1))
+
+        delays[q], rates[q] = _climb(explained, delays[q], rates[q], steps, units)
+        one = slice(q, q + 1)
+        match(here, about, delays[one], rates[one], out[one], energy[one])
+
+
 @dataclass(frozen=True)
 class Estimator:
     """Estimator of a path at a peak of the map: off the grid, or `on_grid` as the centre of its
@@ -334,10 +397,8 @@ class Estimator:
 
     def at(self, local: LocalSpectra, power: np.ndarray, row: int, column: int) -> Estimate:
         """The estimate of a peak of the centred map `power`."""
-        if self.on_grid:
-            w = local.waveform
-            return refine(local, *to_delay(row, column - w.num_chirps // 2, w), ())
-        return refine(local, *start_point(power, row, column, local.waveform))
+        start, steps = self._start(power, row, column, local.waveform)
+        return refine(local, *start, steps)
 
     def at_peaks(
         self,
@@ -349,12 +410,27 @@ class Estimator:
         *,
         separate: bool = False,
     ) -> list[Estimate]:
-        """Return the local spectra at all peaks (Q,); `separate` as in `LocalSpectra`."""
-        spectra = np.ascontiguousarray(spectra)
-        return [
-            self.at(LocalSpectra(spectra, known, row, separate=separate), power, row, column)
-            for row, column in zip(rows.tolist(), columns.tolist(), strict=True)
-        ]
+        """Return the estimates at all peaks (Q,); `separate` as in `LocalSpectra`."""
+        w, sent, num_rx = known.waveform, _sent(known, separate), spectra.shape[1]
+        (delays, rates), steps = self._start(power, rows, columns, w)
+        lows, counts = _rows_about(np.asarray(rows, np.int64), spectra.shape[2])
+        chirps = _room(sent, num_rx, 2 * HALF_WIDTH + 1)
+        energy = np.zeros((len(rows), sent.antennas))
+        out = np.zeros((len(rows), sent.antennas * chirps.blocks * 2 * LANES), np.float32)
+        peaks = lows, counts, delays, rates
+        to = np.array(steps), _units(w), out, energy
+        estimate(np.ascontiguousarray(spectra), chirps, _axis(w), *peaks, *to)
+        energy = np.maximum(energy, 1e-30)
+        channels = _amplitudes(_complex(out, energy, num_rx), energy, w.num_tx)
+        return [Estimate(*e) for e in zip(delays.tolist(), rates.tolist(), channels, strict=True)]
+
+    def _start(
+        self, power: np.ndarray, row: T, column: T, waveform: Waveform
+    ) -> tuple[tuple[T, T], Sequence[float]]:
+        """Start of the search at peaks, and its stencils."""
+        if self.on_grid:
+            return to_delay(row, column - waveform.num_chirps // 2, waveform), ()
+        return start_point(power, row, column, waveform), STENCILS
 
 
 OFF_GRID = Estimator()

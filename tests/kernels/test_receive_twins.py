@@ -197,6 +197,46 @@ def test_matches_of_templates(rows: int):
     np.testing.assert_allclose(kernel_energy, twin_energy, rtol=1e-5)
 
 
+def test_peaks_climbed():
+    """A path in noise, from two starts beside it, one at the end of the rows. Planted bugs in the
+    kernel: the coupling's sign, before or after; the cross alone in the first stencil."""
+    rng = np.random.default_rng(14)
+    room, axis = local_rows(rng, 7)
+    spectra = complex_noise(rng, 3, 20, 26, 24)
+    place = np.arange(26)[:, None] - 20.3 - rng.uniform(-0.1, 0.1)
+    spectra += (40 * np.exp(-(place**2) / 2 + 2j * place)).astype(np.complex64)
+    lows, counts = np.array([17, 20]), np.array([7, 6])
+    delays = np.array([20.1, 21.2]) / (axis.slope * axis.duration)
+    peaks = lows, counts, delays, np.array([3e-10, -4e-10])
+    units = 1 / (axis.slope * axis.duration), 1.5e-9, 0.37
+    to = (
+        np.array([0.2, 0.08]),
+        units,
+        np.zeros((2, 3 * 2 * 2 * LANES), np.float32),
+        np.zeros((2, 3)),
+    )
+    results = []
+    for chosen in TWINS["isac_rt.receive.estimate.estimate"]:
+        args = [a.copy() if isinstance(a, np.ndarray) else a for a in (*peaks, *to)]
+        chosen(spectra, room, axis, *args)
+        results.append(args)
+    kernel, twin = results
+    # float32 sums move the top of a paraboloid by 1e-5 of a stencil
+    np.testing.assert_allclose(kernel[2], twin[2], rtol=0, atol=1e-4 * units[0])
+    np.testing.assert_allclose(kernel[3], twin[3], rtol=0, atol=1e-4 * units[1])
+    most = np.abs(twin[6]).max()
+    np.testing.assert_allclose(kernel[6], twin[6], rtol=0, atol=1e-3 * most)
+    np.testing.assert_allclose(kernel[7], twin[7], rtol=1e-4)
+
+
+@pytest.mark.parametrize("size", [9, 5])
+def test_a_newton_step(size: int):
+    """Planted bug in the kernel: a limit of two stencils."""
+    rng = np.random.default_rng(15)
+    for powers in np.exp(rng.normal(size=(20, size))):
+        assert_twins_agree("isac_rt.receive.estimate.newton", powers, 0.2, 0.31, rtol=1e-9)
+
+
 def test_a_template_added():
     """Planted bugs in the kernel: the transmit antennas' delays left out; the turn from row to row
     conjugated."""

@@ -28,11 +28,11 @@ from isac_rt.receive.chain import cfar_of
 from isac_rt.receive.estimate import (
     STENCILS,
     LocalSpectra,
-    _newton,
     direction_cosine,
     directions,
     excess,
     hann_response,
+    newton,
     refine,
     standard_deviations,
     start_point,
@@ -776,7 +776,7 @@ def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
     ) -> list[float]:
         off = 0.2 * stencil[: 9 if mixed is None else 5] - top
         powers = np.exp(-np.einsum("ki,ij,kj->k", off, bend, off) / 2)
-        down, across, found = _newton(powers, 0.2, 0.0 if mixed is None else mixed)
+        down, across, found = newton(powers, 0.2, 0.0 if mixed is None else mixed)
         assert found == pytest.approx(-bend[0][1], abs=1e-9)
         return [down, across]
 
