@@ -76,6 +76,26 @@ def test_the_reference_has_every_key(site):
     assert "77000000000.0" in page
 
 
+MOST_WORDS = 35_000
+"""Words of all pages together, about three hours of reading."""
+DIARY = re.compile(r"\b20\d\d-\d\d-\d\d\b|`(?!dca1000`)[0-9a-f]{7,40}`")
+"""Dates and commits, which say when something was so and not what is so."""
+
+
+def test_the_pages_are_short_and_no_diary():
+    """Prose wraps at 100 columns. Planted bug: a commit named on a page."""
+    words = 0
+    for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]:
+        text = page.read_text(encoding="utf-8")
+        words += len(text.split())
+        assert not DIARY.search(text), f"{page.name}: {DIARY.search(text)}"
+        prose = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+        for line in prose.splitlines():
+            if not line.startswith(("|", "    ", "$$", "![", "#")):
+                assert len(line) <= 100, f"{page.name}: {line}"
+    assert words < MOST_WORDS
+
+
 def test_links_between_pages_and_files_lead_somewhere():
     """Markdown links to files of the repository, and files named in backquotes that begin with a
     folder of it."""
