@@ -35,8 +35,10 @@ from isac_rt.simulation.setup import Setup, prepare
 from isac_rt.world.swarm import Pose
 
 if TYPE_CHECKING:
+    import sionna.rt as rt
+
     from isac_rt.propagation.clutter.field import ClutterField
-    from isac_rt.propagation.raytrace import RayTracer
+    from isac_rt.world.city.mesh import CityMesh
 
 AREAS = (1.0, 0.25, 0.06, 0.015)
 """Largest area of a cell over its distance [m]: four times fewer scatterers each."""
@@ -52,32 +54,57 @@ LINK = Link("AT", "AT")
 def rows(quick: bool) -> list[dict[str, object]]:
     """Cost against the number of scatterers, and error and cost of leaving the faintest out of the
     samples."""
-    floor, out, hits = floor_seconds((3, 15, 120, 1024)), [], _hits_per_ray()
+    floor, out = floor_seconds((3, 15, 120, 1024)), []
     for area in AREAS[:2] if quick else AREAS:
         setup = prepare(_scene(model="field", cell_area_per_metre_m=area))
-        out += _of_tracing(setup, hits, floor)
+        out += _of_tracing(setup, floor)
     return out + _of_samples(setup, floor, 3 if quick else 7)
 
 
-def _tracer(setup: Setup) -> RayTracer:
-    tracer = tracer_of(setup)
-    assert tracer is not None
-    return tracer
-
-
 def _field(setup: Setup) -> ClutterField:
-    field = _tracer(setup).field
-    assert field is not None
-    return field.whole()
+    tracer = tracer_of(setup)
+    assert tracer is not None and tracer.field is not None
+    return tracer.field.whole()
 
 
 def _scene(**clutter: Any) -> Scenario:
     return alone(frames=FRAMES * (BLOCKS + 1) + 2, clutter=clutter)
 
 
-def _hits_per_ray() -> float:
-    setup = prepare(_scene(model="diffuse", rays=PILOT_RAYS))
-    return len(setup.find(0)[1][LINK]) / PILOT_RAYS
+def sionna_scene(city: CityMesh, carrier: float, place: np.ndarray) -> rt.Scene:
+    """Sionna RT's scene with an isotropic transmitter and receiver at one place."""
+    import mitsuba as mi
+    import sionna.rt as rt
+
+    from isac_rt.world.city.scene import build_scene
+
+    scene = build_scene(city, carrier).scene
+    scene.tx_array = scene.rx_array = rt.PlanarArray(
+        num_rows=1, num_cols=1, pattern="iso", polarization="V"
+    )
+    scene.add(rt.Transmitter("tx", mi.Point3f(*place.tolist())))
+    scene.add(rt.Receiver("rx", mi.Point3f(*place.tolist())))
+    return scene
+
+
+def traced_anew(scene: rt.Scene, place: np.ndarray, rays: int) -> np.ndarray:
+    """Power gains (paths,) of Sionna RT's diffuse paths from a place back to itself."""
+    import mitsuba as mi
+    import sionna.rt as rt
+
+    for device in (scene.get("tx"), scene.get("rx")):
+        device.position = mi.Point3f(*place.tolist())
+    options = {"los": False, "specular_reflection": False, "refraction": False}
+    found = rt.PathSolver()(
+        scene,
+        max_depth=1,
+        samples_per_src=rays,
+        max_num_paths_per_src=rays,
+        diffuse_reflection=True,
+        **options,
+    )
+    real, imag = (np.asarray(x, np.float64).ravel() for x in found.a)
+    return (real**2 + imag**2)[np.asarray(found.valid).ravel()]
 
 
 def advance(setup: Setup, frames: range) -> tuple[float, float, int]:
@@ -100,21 +127,23 @@ def _local(setup: Setup, when: float) -> Pose:
     return replace(pose, position=pose.position - setup.city.origin)
 
 
-def _of_tracing(setup: Setup, hits_per_ray: float, floor: float) -> list[dict[str, object]]:
+def _of_tracing(setup: Setup, floor: float) -> list[dict[str, object]]:
     """Advancing and tracing anew in turns, the first turn to warm up."""
     scatterers = len(_field(setup).cells)
-    again = prepare(_scene(model="diffuse", rays=round(scatterers / hits_per_ray)))
+    place = _local(setup, 0.0).position
+    scene = sionna_scene(setup.city, setup.waveform.carrier_frequency, place)
+    rays = round(scatterers * PILOT_RAYS / len(traced_anew(scene, place, PILOT_RAYS)))
     seconds: dict[str, list[float]] = {"advanced": [], "traced anew by Sionna RT": []}
     powers: list[list[float]] = []
     for block in range(BLOCKS + 1):
         frames = range(FRAMES * block, FRAMES * (block + 1))
         cost, power, _ = advance(setup, frames)
         seconds["advanced"].append(cost)
-        when = setup.timetable.epoch(frames[FRAMES // 2])
+        place = _local(setup, setup.timetable.epoch(frames[FRAMES // 2])).position
         begin = time.process_time()
-        amplitude = _tracer(again)._diffuse_hits({"AT": _local(setup, when)}, [LINK])[LINK][0]
+        gains = traced_anew(scene, place, rays)
         seconds["traced anew by Sionna RT"].append(time.process_time() - begin)
-        powers.append([power, float((amplitude**2).sum())])
+        powers.append([power, float(gains.sum())])
     total = np.sum(powers, axis=0)
     row: dict[str, Any] = {
         "kind": "clutter",

@@ -75,7 +75,7 @@ def profile(paths, waveform):
     )
 
 
-for model in ("diffuse", "field"):
+for model in ("rayleigh", "field"):
     scenario = irt.load(
         "../scenes/street_canyon.yaml",
         [f"clutter.model={model}", "frame_interval_s=0.008", "receiver_preset=plain"],

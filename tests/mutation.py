@@ -70,7 +70,6 @@ TESTS_OF = {
     "propagation/clutter/penumbra.py": "test_penumbra",
     "propagation/clutter/sight.py": "test_penumbra test_clutter_field test_clutter_coherence",
     "propagation/ways.py": "test_ways test_propagation test_raytrace_scenes",
-    "propagation/clutter/resampled.py": "test_raytrace_scenes test_clutter_field",
     "propagation/legs/reflection.py": "test_mirrors test_chains test_raytrace_scenes",
     "propagation/pathset.py": "test_propagation test_ifsignal",
     "propagation/legs/bodies.py": "test_diffraction test_shadow_edges",

@@ -30,17 +30,15 @@ import copy
 import logging
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
 
 from isac_rt.frame.link import Link
-from isac_rt.plain import plain
 from isac_rt.propagation.clutter.cells import Density
 from isac_rt.propagation.clutter.field import ClutterField
 from isac_rt.propagation.clutter.merging import NoiseFloor
-from isac_rt.propagation.clutter.resampled import scatterer_phase
 from isac_rt.propagation.clutter.sight import Flight
 from isac_rt.propagation.clutter.two_bounces import TwoBounces
 from isac_rt.propagation.free_space import FreeSpace
@@ -53,7 +51,6 @@ from isac_rt.propagation.legs.geometry import (
     edges_in_any_order,
     one_of_each_chain,
     plane_of_each_face,
-    straight,
     unfold,
 )
 from isac_rt.propagation.legs.images import ASIDE, SLACK, STRETCH, Images
@@ -63,7 +60,6 @@ from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.settings import Clutter, Propagation
 from isac_rt.propagation.ways import LinkState, Ways
-from isac_rt.storage import checksum, kept, pack
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.city.scene import shared_scenes
 from isac_rt.world.swarm import Pose, Swarm
@@ -74,21 +70,10 @@ if TYPE_CHECKING:
 MOST_PATHS = 4_000_000
 """Paths per source that the ray tracer is given room for. It drops what is beyond in silence, so
 fewer rays get less room."""
-MOST_RAYS_KEPT = 20_000
-"""Rays of a diffuse solution that is kept for later runs, at most: with more, a run of a hundred
-frames would fill the store."""
 LEAKAGE_S = 1e-9
 """Delay of what a receiver hears of its own transmitter: 30 cm of way."""
 
 _LOG = logging.getLogger(__name__)
-
-
-class _Hits(NamedTuple):
-    """Diffuse paths of a link: what comes of a hit (K,), its face (K,) and its point (K, 3)."""
-
-    amplitude: np.ndarray
-    face: np.ndarray
-    point: np.ndarray
 
 
 class RayTracer:
@@ -195,11 +180,10 @@ class RayTracer:
             legs, dropped, _ = self._solved_legs(local, self._solved_with)
         bodies = Bodies.of(self._swarm.uavs, local)
         legs = past_edges_and_bodies(legs, local, self._edges, bodies, self._free.wavelength)
-        hits = self._diffuse_hits(local, links) if self._clutter.model == "diffuse" else {}
         paths = {}
         for link in links:
             state = LinkState(link, epoch, local[link.tx], local[link.rx], self._free.names)
-            paths[link] = self._link(state, local, legs, hits, bodies)
+            paths[link] = self._link(state, local, legs, bodies)
         return Traced(paths, dropped)
 
     def _local(self, poses: dict[str, Pose]) -> dict[str, Pose]:
@@ -215,9 +199,8 @@ class RayTracer:
         sinks: dict[str, np.ndarray],
         max_depth: int,
         samples_per_src: int,
-        **options: bool,
     ) -> rt.Paths:
-        """Solve between isotropic single elements at places by name.
+        """Mirror reflections between isotropic single elements at places by name.
 
         Raises
         ------
@@ -243,14 +226,13 @@ class RayTracer:
             max_num_paths_per_src=room,
             refraction=False,
             synthetic_array=True,
-            **options,
+            specular_reflection=max_depth > 0,
         )
         valid = np.asarray(found.valid)  # (rx, tx, path): the array is synthetic
         most = valid.sum(axis=(0, 2)).max()
         if most >= MOST_PATHS:
             raise ValueError(
-                f"the ray tracer found its limit of {MOST_PATHS} paths; lower propagation.rays or "
-                "clutter.rays"
+                f"the ray tracer found its limit of {MOST_PATHS} paths; lower propagation.rays"
             )
         return found
 
@@ -274,7 +256,6 @@ class RayTracer:
             sinks | beside,
             max_depth=depth,
             samples_per_src=num_rays,
-            specular_reflection=depth > 0,
         )
         amplitude, valid, faces, points = self._read(found, max(depth, 1))
         corner = valid & ((faces >= 0).sum(axis=-1) > 1)
@@ -352,7 +333,6 @@ class RayTracer:
         state: LinkState,
         local: dict[str, Pose],
         legs: dict[Link, LegSet],
-        hits: dict[Link, _Hits],
         bodies: Bodies,
     ) -> PathSet:
         link, antennas = state.link, self._free.antennas
@@ -360,8 +340,6 @@ class RayTracer:
         others = [name for name in self._free.names if name not in link]
         if others:
             parts.append(self._by_way_of(state, {name: local[name] for name in others}, legs))
-        if link in hits:
-            parts.append(self._scattered(state, *hits[link]))
         if self.field is not None:
             parts.append(self.field.paths(state, antennas, bodies))
         if self.two_bounces is not None:
@@ -430,70 +408,4 @@ class RayTracer:
             bounces=bounces,
             points=np.concatenate([a.points, middle, b.points[:, ::-1]], axis=1),
             faces=np.concatenate(chain, axis=1),
-        )
-
-    @cached_property
-    def _city_content(self) -> str:
-        """Digest of all of the city that Sionna's solutions depend on."""
-        return checksum(*pack([plain(self._city), self._scenes.carrier_frequency, mi.variant()]))
-
-    def _diffuse_hits(self, local: dict[str, Pose], links: list[Link]) -> dict[Link, _Hits]:
-        """Hit points and scattered amplitudes of every link, from one solve or from one that an
-        earlier run kept; points on the float64 mesh, in a fixed order."""
-        sources, sinks = (
-            {name: local[name].position for name in names}
-            for names in (dict.fromkeys(tx for tx, _ in links), self._terminals)
-        )  # as many sinks each frame: a new number compiles anew
-
-        def found() -> list[_Hits]:
-            return self._diffuse_solution(sources, sinks, links)
-
-        rays = self._clutter.rays
-        if rays > MOST_RAYS_KEPT:
-            return dict(zip(links, found(), strict=True))
-        where = [[*sources], [*sources.values()], [*sinks], [*sinks.values()], links]
-        hits = kept("diffuse", [self._city_content, rays, where], found)
-        return {link: _Hits(*of_link) for link, of_link in zip(links, hits, strict=True)}
-
-    def _diffuse_solution(
-        self, sources: dict[str, np.ndarray], sinks: dict[str, np.ndarray], links: list[Link]
-    ) -> list[_Hits]:
-        """Sionna's diffuse paths of some links between places by name."""
-        found = self._solve(
-            sources,
-            sinks,
-            max_depth=1,
-            samples_per_src=self._clutter.rays,
-            los=False,
-            specular_reflection=False,
-            diffuse_reflection=True,
-        )
-        amplitude, valid, faces, points = self._read(found, 1)
-        out = []
-        for tx, rx in links:
-            i, j = [*sinks].index(rx), [*sources].index(tx)
-            which = np.flatnonzero(valid[i, j] & (faces[i, j, :, 0] >= 0))
-            face, point = faces[i, j, which, 0], points[i, j, which, 0]
-            order = np.lexsort(point.T)
-            out.append(_Hits(np.abs(amplitude[i, j, which])[order], face[order], point[order]))
-        return out
-
-    def _scattered(
-        self, state: LinkState, amplitude: np.ndarray, face: np.ndarray, point: np.ndarray
-    ) -> PathSet:
-        """Scatterers at rest on the mesh, each with a phase of its own that belongs to its
-        place."""
-        normal = self._city.normals[face]
-        on_plane = (
-            point - ((normal * point).sum(1) - self._city.plane_offsets[face])[:, None] * normal
-        )
-        ways = Ways.over(straight(state.start, on_plane), straight(state.end, on_plane))
-        turn = np.exp(1j * scatterer_phase(point, self._free.seed))
-        return state.paths(
-            ways,
-            amplitude * turn * state.elements(self._free.antennas, ways),
-            PathKind.DIFFUSE,
-            bounces=1,
-            points=on_plane[:, None],
-            faces=face[:, None],
         )

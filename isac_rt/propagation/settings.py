@@ -63,14 +63,15 @@ class Clutter(Node):
         "direction": "leave it out: directions are drawn over the field of view",
         "cell_correlation": "leave it out: cells are independent",
         "redraw": "leave it out: every frame has a draw of its own",
+        "model: diffuse": "model: field, scatterers that stay in place from frame to frame",
+        "rays": "model: field with max_error_db: a larger error takes fewer scatterers",
     }
 
-    model: Literal["none", "gaussian", "rayleigh", "diffuse", "field"] = "none"
+    model: Literal["none", "gaussian", "rayleigh", "field"] = "none"
     """Kind of clutter. `none`, the default; with `noise.model: snr` it is the paper's "Gaussian
     noise environment". `gaussian`: white noise beside the thermal noise. `rayleigh`, the paper's
     urban model: a run of range cells that stand still. `field`: scatterers pinned to the city's
-    mesh, the same in all frames and links. `diffuse`: Sionna RT's own diffuse paths, drawn anew in
-    every frame, to compare with."""
+    mesh, the same in all frames and links."""
     clutter_to_noise_db: Decibels = 0.0
     """Power of `gaussian` clutter over that of the thermal noise [dB]. By default they are
     alike."""
@@ -85,9 +86,6 @@ class Clutter(Node):
     """Least and greatest range of the middle of `rayleigh` clutter that is drawn [m], twice the
     same to fix it; one way at an active terminal, path length at a passive one. The default is the
     paper's."""
-    rays: Annotated[int, Field(ge=100, le=10_000_000)] = 20_000
-    """Rays that a transmitter sends out for `diffuse` clutter. More rays give more and weaker
-    paths, the same power in all, and take longer. The default gives some thousand paths a link."""
     max_error_db: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] = 0.2
     """Error that nine of ten cells keep to [dB], for `field`: of the mean clutter power in a range
     cell of 4 m, and of noise plus mean clutter in a range-Doppler cell, under whose noise
@@ -131,7 +129,6 @@ CLUTTER_KEYS: dict[str, frozenset[str]] = {
             "centre_m",
         }
     ),
-    "diffuse": frozenset({"rays"}),
     "field": frozenset({"max_error_db", "cell_area_per_metre_m", "smallest_cell_m2", "mirrors"}),
 }
 """Keys that each clutter model understands, beside model; the others may stand and are not written

@@ -529,13 +529,12 @@ class Scenario(Node):
                     "relative goes with noise.model snr only: a link budget needs a radar "
                     "cross-section; use constant or tr38901",
                 )
-        if self.clutter.model in ("diffuse", "field") and (
+        if self.clutter.model == "field" and (
             self.propagation.model != "ray_traced" or self.city is None
         ):
             yield Problem(
                 (("clutter", "model"), ("propagation", "model"), ("city",)),
-                f"{self.clutter.model} needs propagation.model ray_traced and a city to scatter "
-                "from; "
+                "field needs propagation.model ray_traced and a city to scatter from; "
                 "add them or set clutter.model to none",
             )
         traced = self.propagation.model == "ray_traced" and self.city is not None

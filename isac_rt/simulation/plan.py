@@ -387,9 +387,8 @@ def mechanisms(p: Propagation, c: Clutter) -> dict[str, Any]:
         "ghosts": traced and p.ghosts,
         "leakage": traced and p.leakage.enabled,
         "clutter": c.model,
-        "clutter_bounces": None if c.model not in ("field", "diffuse") else 2 if c.mirrors else 1,
+        "clutter_bounces": None if c.model != "field" else 2 if c.mirrors else 1,
         "rays": p.rays if traced else None,
-        "clutter_rays": c.rays if c.model == "diffuse" else None,
     }
 
 

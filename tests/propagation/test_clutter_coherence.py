@@ -1,5 +1,5 @@
 """The clutter field in flight: coherent with a separate sum over its list of scatterers, without
-jumps, and faster than a re-trace."""
+jumps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from scipy.ndimage import uniform_filter
 
 from isac_rt import scenario
 from isac_rt.frame.link import Link
-from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import CityMesh, load_city
@@ -42,7 +41,7 @@ def crossing() -> CityMesh:
     return load_city(CROSSING, ".", F_C, (0.4, -0.3, 0.2))
 
 
-def flown(waypoints, model="field", **clutter):
+def flown(waypoints, **clutter):
     """A tracer for one terminal in flight through the crossing (isotropic elements, 0 dBi),
     contiguous frames, and its trajectory."""
     w0 = [{"time_s": float(t), "position_m": list(map(float, x))} for t, x in waypoints]
@@ -53,7 +52,7 @@ def flown(waypoints, model="field", **clutter):
         "city": {"source": "canyon"},
         "array": {"element_pattern": "isotropic", "element_gain_dbi": 0.0},
         "propagation": {"model": "ray_traced", "max_bounces": 0, "leakage": {"enabled": False}},
-        "clutter": {"model": model, **clutter},
+        "clutter": {"model": "field", **clutter},
     }
     s = scenario.Scenario.model_validate(tree)
     return propagation_in(crossing(), s), swarm_of(s)
@@ -143,30 +142,6 @@ def test_field_is_coherent_with_a_separate_sum(name):
             edges += int(((share > 0) & (share < 1)).sum())
     assert edges > 0  # shadow edges were there
     assert worst >= 0.99, worst
-
-
-def test_retraced_clutter_is_not_coherent():
-    """The same test on Sionna's diffuse paths traced anew: the points of the first trace, summed in
-    float64 at the next place, against the next trace. It fails at every step."""
-    model, swarm = flown(STREETS["along"], model="diffuse", rays=5_000)
-    flight, best = swarm.trajectories["A"], 0.0
-    for time in (0.13, 1.29):
-        speed = np.linalg.norm(flight.pose(time).velocity)
-        first = traced(model, flight, time)
-        for step in STEPS:
-            second = traced(model, flight, time + step / speed)
-            place = flight.pose(time + step / speed).position
-            length = 2 * np.linalg.norm(first.points[:, 0] - place, axis=1)
-            best = max(
-                best,
-                correlation(profile(length, first.gain), profile(C * second.delay, second.gain)),
-            )
-    assert best < 0.9
-
-
-def traced(model, flight, time: float):
-    paths = model.trace({"A": flight.pose(time)}, time, [("A", "A")]).paths["A", "A"]
-    return paths.select(paths.kind == PathKind.DIFFUSE)
 
 
 ROUND_A_CORNER = [  # up one street of the crossing and into the other, 50 m at 10 m/s

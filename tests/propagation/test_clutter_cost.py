@@ -9,6 +9,7 @@ from time import process_time
 import numpy as np
 import pytest
 
+from benchmarks.clutter import sionna_scene, traced_anew
 from isac_rt import scenario
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.link import Link
@@ -58,7 +59,8 @@ def test_advancing_is_far_cheaper_than_tracing_anew():
     begin = process_time()
     model, swarm, antennas = tracer(city, model="field", cell_area_per_metre_m=0.0113)
     setup = process_time() - begin
-    again, _, _ = tracer(city, model="diffuse", rays=160_000)
+    place = swarm.poses(0.0)["A"].position - city.origin
+    scene = sionna_scene(city, 77e9, place)
     scatterers = len(model.field.cells)
     advance, whole, trace, found = [], [], [], []
     for block in range(4):
@@ -79,9 +81,9 @@ def test_advancing_is_far_cheaper_than_tracing_anew():
         whole.append(seconds[1] / (FRAMES // 4) / scatterers * PATHS)
         for _ in range(2):
             begin = process_time()
-            hits = again._diffuse_hits({"A": local}, [("A", "A")])["A", "A"]
-            trace.append((process_time() - begin) / len(hits[0]) * PATHS)
-            found.append(len(hits[0]))
+            hits = traced_anew(scene, local.position, 160_000)
+            trace.append((process_time() - begin) / len(hits) * PATHS)
+            found.append(len(hits))
     size = (model.field.nbytes + seen.nbytes + gain.nbytes) / scatterers
     ratio = np.median(trace[2:]) / np.median(advance[1:])
     print(

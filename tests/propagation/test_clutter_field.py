@@ -22,10 +22,8 @@ from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.clutter import cells as clutter_cells
 from isac_rt.propagation.clutter.cells import Density, cut
-from isac_rt.propagation.clutter.resampled import scatterer_phase
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.ways import LinkState
-from isac_rt.randomness import seed_sequence
 from isac_rt.receive.clutter.covariance import Bucketed
 from isac_rt.receive.clutter.power import TAPER, Taper, expected_power
 from isac_rt.receive.directions import searches
@@ -240,20 +238,6 @@ def test_points_are_hashed_from_the_state_of_their_face_and_the_code_of_their_ce
         a, b, c = corners
         expected = a + np.sqrt(one) * (b - a + share * (c - b))
         assert point == pytest.approx(expected, abs=1e-12)
-
-
-def test_phase_of_a_scatterer_is_a_hash_of_its_place():
-    """splitmix64 over the float32 bits of the place, one coordinate after the other, in whole
-    numbers of Python. Planted bugs: a step of another sign, half a turn."""
-    points, start = (
-        np.array([[0.31, -7.7, 12.9], [1e5, 0.0, -0.0]]),
-        seed_sequence(5, "scatterers").generate_state(1, np.uint64)[0],
-    )
-    for point, found in zip(points, scatterer_phase(points, 5), strict=True):
-        state = int(start)
-        for value in point:
-            state = splitmix64(state, int.from_bytes(np.float32(value).tobytes(), sys.byteorder))
-        assert found == pytest.approx(2 * np.pi * (state >> 11) / 2**53, rel=1e-15, abs=0)
 
 
 def test_cells_do_not_know_where_the_city_was_recentred():

@@ -307,9 +307,13 @@ def test_commit_is_of_the_package_not_of_the_current_folder(tmp_path, monkeypatc
     assert provenance.commit() == here
 
 
-GIVEN_UP = ["summary.fidelity.traced_frames", "summary.fidelity.cost_model"]
+GIVEN_UP = [
+    "summary.fidelity.clutter_rays",
+    "summary.fidelity.traced_frames",
+    "summary.fidelity.cost_model",
+]
 """Keys that no longer say anything: walls are found from all of the flight, not frame by frame;
-there is no cost model any more."""
+there are no rays of clutter and no cost model any more."""
 EARLIER = Path(__file__).parent / "earlier"
 """A run of an earlier version: its summary, its scenario and the layout of its dataset."""
 

@@ -176,10 +176,6 @@ def test_scenes_load_without_doubts_and_round_trip(path, tmp_path):
             "tracking.confirm_hits = 6: 6 hits cannot be reached within confirm_window = 5",
         ),
         (
-            BASE + "clutter: {model: diffuse}\n",
-            "clutter.model = diffuse: diffuse needs propagation.model ray_traced and a city",
-        ),
-        (
             BASE + "clutter: {model: field}\n",
             "clutter.model = field: field needs propagation.model ray_traced and a city",
         ),

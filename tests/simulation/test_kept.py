@@ -12,11 +12,9 @@ import pytest
 
 from isac_rt import load, runtime
 from isac_rt.plain import plain
-from isac_rt.propagation import raytrace
 from isac_rt.propagation.clutter import field as clutter_field
 from isac_rt.propagation.clutter import sight
 from isac_rt.propagation.clutter.field import in_local
-from isac_rt.propagation.raytrace import RayTracer
 from isac_rt.simulation.setup import prepare
 from isac_rt.storage import KEPT, pack
 from isac_rt.world import area
@@ -141,47 +139,3 @@ def test_a_bent_file_is_made_again(place):
             file.write_bytes(good[:at] + bytes([good[at] ^ 4]) + good[at + 1 :])
             assert prepared(place, {}) == first
             assert file.read_bytes() == good
-
-
-STREET = TREE | {
-    "city": {"source": "canyon", "street_width_m": 21.3, "wall_material": "brick"},
-    "swarm": {
-        "AT": {"role": "active", "position_m": [-3.1, -20.3, 9.2], "velocity_mps": [0, 5.3, 0]},
-        "PT1": {"role": "passive", "position_m": [4.6, 13.1, 11.4], "boresight": [0, -1, 0]},
-    },
-    "clutter": {"model": "diffuse", "rays": 300},
-}
-
-
-def clutter_of(change: dict) -> bytes:
-    """Paths of a frame whose clutter Sionna RT solves, as bytes."""
-    area._near_city.cache_clear()
-    area._loaded_city.cache_clear()
-    frame = prepare(load(changed(STREET, change))).frame(1)
-    tree, arrays = pack([vars(paths) for paths in frame.paths.values()])
-    return tree.encode() + arrays
-
-
-def test_sionna_solves_the_clutter_of_a_frame_once(place, monkeypatch):
-    """The second time it is found, to the same bits; with other rays, another flight, another
-    material or another carrier it is solved anew; with very many rays it is not kept. Planted bugs:
-    a key without the places, without the materials, without the carrier."""
-    solved, solve = [], RayTracer._solve
-    monkeypatch.setattr(RayTracer, "_solve", lambda *a, **b: solved.append(1) or solve(*a, **b))
-    first = clutter_of({})
-    assert len(solved) == 1
-    assert clutter_of({}) == first
-    assert clutter_of({"seed": 4}) != first  # each scatterer's phase is the run's own
-    assert len(solved) == 1
-    changes = [
-        {"clutter": {"rays": 301}},
-        {"swarm": {"PT1": {"position_m": [4.6, 13.1, 11.5]}}},
-        {"city": {"materials": {"brick": {"scattering_coefficient": 0.31}}}},
-        {"city": {"materials": {"brick": {"scattering_pattern": "directive"}}}},
-        {"radio": {"carrier_hz": 76e9}},
-    ]
-    assert len({first, *map(clutter_of, changes)}) == len(changes) + 1
-    assert len(solved) == len(changes) + 1
-    monkeypatch.setattr(raytrace, "MOST_RAYS_KEPT", 299)
-    assert clutter_of({}) == first
-    assert len(solved) == len(changes) + 2

@@ -151,8 +151,8 @@ def test_street_canyon_end_to_end():
 
 @pytest.mark.sionna
 def test_ray_traced_runs_repeat_bit_for_bit():
-    """Sionna's order of paths varies from call to call; sorted, nothing of it is left. Planted bug:
-    the diffuse hits unsorted."""
+    """Rays and kernels run in threads; nothing of their order is left. Planted bug: noise from a
+    generator without a seed."""
     said = ["modulation.acquisition_frames=1", "receiver_preset=plain"]
     scenario = load(SCENES / "street_canyon.yaml", said, frames=2)
     first, second = simulate.run(scenario), simulate.run(scenario)

@@ -1,2 +1,1 @@
-"""Clutter: drawn by a law (`rayleigh`), drawn anew from the mesh in every frame (`resampled`), or
-pinned to it (`field`)."""
+"""Clutter: drawn by a law (`rayleigh`) or pinned to the mesh (`field`)."""
