@@ -146,9 +146,12 @@ NAMES = {"targets": "UAV", "links": "LINK"}
 ELSEWHERE = {
     "rmse_tracked",
     "counts",
-    "apart.targets.bounds",
     "apart.targets.gospa",
-    "apart.terminals.bounds",
+    *(
+        f"apart.{group}.{key}"
+        for group in ("targets", "terminals")
+        for key in ("bounds", "rmse", "rmse_tracked", "losses")
+    ),
     "targets.UAV.median",
     "targets.UAV.p90",
     "targets.UAV.bound_median",

@@ -194,12 +194,6 @@ def _say_budget(rows: list[Any]) -> None:
     )
 
 
-_WORDS = (
-    "SER and BER are shares of all data symbols and bits sent; those without a decision are wrong, "
-    "and undecided is their share. Hit rate: UAVs in view and not hidden that were found within a "
-    "cell on every axis. RMSE: of what the UAV's own path explains. GOSPA: one number for tracks "
-    "against truth, worse than nothing above the empty picture. The report has more."
-)
 _PLAN_WORDS = (
     "Errors are estimates from a few frames. rad: of a path's phase; dB: power left out, over the "
     "noise of a cell of the range-Doppler map of one antenna; relative: of the samples. A plane "
@@ -207,46 +201,52 @@ _PLAN_WORDS = (
     "frame. Too weak: together with all others in its range cell; out of reach: its beat is "
     "stopped by the IF filter."
 )
-"""What a newcomer asks of the tables."""
+"""Explanation of the table of the plan."""
 
 
 def _say_summary(results: Results) -> None:
-    from isac_rt.views.tables import gospa_table, number, per_terminal, rmse_table, side_by_side
+    from isac_rt.views import tables
 
-    left_out = {"Role", "Matched", "Matched, tracked"}
-    left_out |= {"Data frames read", "Of these late", "Frames late, at most"}  # a line below
-    compared = side_by_side(results.summary)
-    for part in (
-        per_terminal(results.summary),
-        rmse_table(results.summary),
-        gospa_table(results.summary),
-        *([compared] if compared.rows else []),
-    ):
-        kept = [i for i, title in enumerate(part.columns) if title not in left_out]
-        say_table([part.columns[i] for i in kept], [[row[i] for i in kept] for row in part.rows])
-    found = ", ".join(
-        f"{n:,} {kind.replace('_', ' ')}" for kind, n in results.summary["paths"].items() if n
+    summary = results.summary
+    shown = (
+        tables.data_table(summary),
+        *(
+            table(summary, group)
+            for group in ("targets", "terminals")
+            for table in (tables.hit_table, tables.rmse_table)
+        ),
+        tables.side_by_side(summary),
     )
-    for name, block in results.summary["links"].items():
-        late = block.get("latency_frames")
-        if late is not None and late["late"]:
-            say(
-                f"{name.replace('->', ' to ')}: {late['late']} of {late['read']} data frames read "
-                f"late, by {late['most']} frames at most"
-            )
-        counts = {k.replace("_", " "): n for k, n in block["losses"].items() if n}
-        if counts:
-            became = ", ".join(f"{n} {cause}" for cause, n in counts.items())
-            say(f"{name.replace('->', ' to ')}: of {sum(counts.values())} UAVs in view {became}")
-        by = {k.replace("_", " "): n for k, n in block["false_tracks"].items() if n}
-        if by:
-            total = number(block["false_tracks_per_frame"])
-            causes = ", ".join(f"{number(n)} {cause}" for cause, n in by.items())
-            say(f"{name.replace('->', ' to ')}: {total} false tracks a frame, by {causes}")
-    seconds = results.summary["timing_s"]
-    out().print(_WORDS)
-    spent = f"{number(seconds['total'])} s of processor time, {number(seconds['wall']['total'])} s"
-    say(f"paths: {found}; {spent} by the clock")
+    for table in shown:
+        if table.rows:
+            say_table(table.columns, table.rows)
+            say("")
+    for name, block in summary["links"].items():
+        targets = block["apart"]["targets"]
+        _say_causes(
+            f"{tables.link_words(name)}: of {targets['in_view']} target-frames in view",
+            targets["losses"],
+        )
+        _say_causes(
+            f"{tables.link_words(name)}: of {tables.number(block['false_tracks_per_frame'])} false "
+            "tracks per frame",
+            block["false_tracks"],
+        )
+    out().print(tables.legend(*shown))
+    found = ", ".join(
+        f"{n:,} {kind.replace('_', ' ')}" for kind, n in summary["paths"].items() if n
+    )
+    seconds = summary["timing_s"]
+    spent = f"{tables.number(seconds['total'])} s of processor time"
+    say(f"paths: {found}; {spent}, {tables.number(seconds['wall']['total'])} s elapsed")
+
+
+def _say_causes(whole: str, parts: Mapping[str, float]) -> None:
+    """Print the parts of a whole that are not zero, by cause."""
+    from isac_rt.views.tables import number
+
+    if counted := [f"{number(n)} {cause.replace('_', ' ')}" for cause, n in parts.items() if n]:
+        say(f"{whole}: {', '.join(counted)}")
 
 
 def plan(

@@ -36,30 +36,17 @@ class Results:
     scenario: Scenario
 
     def __repr__(self) -> str:
-        def say(value: float | None, form: str) -> str:
+        def text(value: float | None, form: str) -> str:
             return "-" if value is None else format(value, form)
 
-        kinds = {
-            "hit_rate": ("hit rate", ".2f"),
-            "ser_delay": ("delay SER", ".2e"),
-            "ser_dpsk": ("DPSK SER", ".2e"),
-        }
-        blocks = self.summary["terminals"].items()
-        lines = [
-            f"  {name}: "
-            + ", ".join(f"{words} {say(b[key], form)}" for key, (words, form) in kinds.items())
-            for name, b in blocks
-        ]
-        return (
-            "\n".join(
-                [
-                    f"<Results of {self.scenario.name}: {self.summary['frames']} frames, seed "
-                    f"{self.summary['seed']}",
-                    *lines,
-                ]
-            )
-            + ">"
-        )
+        lines = [f"<Results of {self.scenario.name}: {self.summary['frames']} frames, seed "]
+        lines[0] += str(self.summary["seed"])
+        for name, block in self.summary["terminals"].items():
+            targets = block["apart"]["targets"]
+            hits = f"{text(targets['hit_rate'], '.2f')} (n = {targets['in_view']})"
+            delay, dpsk = (text(block[key], ".2e") for key in ("ser_delay", "ser_dpsk"))
+            lines.append(f"  {name}: hit rate of targets {hits}, SER delay {delay}, DPSK {dpsk}")
+        return "\n".join(lines) + ">"
 
 
 @dataclass(frozen=True)

@@ -174,6 +174,7 @@ class Sensing:
             "in_view": int(self.seen[:, i].sum()),
             "hidden": int(self.hidden[:, i].sum()),
             "found": int(self.hit[:, i].sum()),
+            "detected": int(np.isfinite(errors[:, 0]).sum()),
             "tracked": int(followed.sum()),
             "switches": int(self.switched[:, i].sum()),
             "interruptions": int(self.resumed[:, i].sum()),
@@ -186,13 +187,21 @@ class Sensing:
         }
 
     def _found(self, of: np.ndarray) -> dict[str, Any]:
-        """Target-frames in view of some of the UAVs (F, U), and the share of them that was
-        found."""
+        """Count the target-frames in view of some of the UAVs (F, U) and those that were found,
+        and average the errors of their detections and tracks."""
         seen = self.seen & of
+        detected, tracked = (
+            np.isfinite(errors[..., 0]) & seen for errors in (self.detected, self.tracked)
+        )
         return {
             "in_view": int(seen.sum()),
             "hit_rate": share(int((self.hit & seen).sum()), int(seen.sum())),
             "bounds": self._bounds(seen),
+            "detected": int(detected.sum()),
+            "tracked": int(tracked.sum()),
+            "rmse": _by_axis(self.detected[detected], rms),
+            "rmse_tracked": _by_axis(self.tracked[tracked], rms),
+            "losses": _counts(self.loss[seen]),
         }
 
     def _bounds(self, seen: np.ndarray) -> dict[str, float | None]:

@@ -400,20 +400,22 @@ def _shade(ax: Axes, t: np.ndarray, active: np.ndarray, colour: str) -> None:
         ax.axvspan(t[first] - half, t[last - 1] + half, color=colour, alpha=0.10, lw=0)
 
 
-def error_cdf(ax: Axes, dataset: xr.Dataset, name: str) -> Axes:
-    """Distribution of the absolute errors of each terminal: raw dashed, tracked solid."""
+def error_cdf(ax: Axes, dataset: xr.Dataset, name: str, terminals: bool = False) -> Axes:
+    """Distribution of the absolute errors of each link's estimates of targets, or of terminals,
+    which report their position: detections dashed, tracks solid."""
     scale, unit = _UNITS[name]
-    for o, terminal in enumerate(dataset.observer.values):
-        for group, dash in (("detected", "--"), ("tracked", "-")):
-            e = np.abs(errors_of(dataset, group, name)[:, o]).ravel() * scale
-            e = np.sort(e[np.isfinite(e) & (dataset["truth_range"].values[:, o].ravel() > 0)])
+    group = dataset.cooperative.values == terminals
+    for o, link in enumerate(dataset.observer.values):
+        for estimates, dash in (("detected", "--"), ("tracked", "-")):
+            e = np.abs(errors_of(dataset, estimates, name)[:, o][group[:, o]]) * scale
+            e = np.sort(e[np.isfinite(e) & (dataset.truth_range.values[:, o][group[:, o]] > 0)])
             if e.size:
                 ax.plot(
                     np.maximum(e, 1e-9),
                     np.arange(1, e.size + 1) / e.size,
                     dash,
                     color=colour_of(o),
-                    label=f"{terminal} {'raw' if group == 'detected' else 'tracked'} ({e.size})",
+                    label=f"{link} {estimates} (n = {e.size})",
                 )
     ax.set(xscale="log", ylim=(0, None), yticks=np.linspace(0, 1, 6))
     ax.xaxis.set_major_locator(LogLocator(numticks=_STEPS))
@@ -643,7 +645,9 @@ def _all(d: xr.Dataset, city: CityMesh | None, every: bool) -> Iterator[Drawing]
             2.53,
             one_x=True,
         )
-    yield Drawing("errors", [partial(error_cdf, dataset=d, name=m) for m in MEASURES], 3.5, 2)
+    for name, terminals in (("errors", False), ("errors_terminals", True)):
+        draw = [partial(error_cdf, dataset=d, name=m, terminals=terminals) for m in MEASURES]
+        yield Drawing(name, draw, 3.5, 2)
     if d.sizes["path"]:
         draw = [
             partial(path_power, dataset=d, observer=o, against=against)

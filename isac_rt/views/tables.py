@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import compress
 from typing import Any
 
 from isac_rt.results.losses import LOSSES
@@ -34,39 +33,58 @@ def number(value: Any, digits: int = 3) -> str:
     return f"{value:.{digits}g}" if abs(value) < 1e4 else f"{value:,.0f}"
 
 
+LEGEND = {
+    "SER delay": "SER, BER: share of the symbols or bits sent that were decided wrongly or erased.",
+    "Erased": "Erased: share of the symbols without a decision.",
+    "Bit rate [kbit/s]": "Bit rate: decided bits over the whole run, pilots and pauses included.",
+    "Late": "Late: data frames read after later ones had been received.",
+    "In view": "In view: UAVs times frames in the field of view and not occluded.",
+    "Hit rate": "Hit rate: share of those in view with a detection of their own path within one "
+    "resolution cell on every axis.",
+    "Noise only": "Noise only: mean detection probability of this detector in noise alone.",
+    "Matched filter": "Matched filter: that of a filter at the true range, velocity and direction; "
+    "no receiver finds more.",
+    "False alarms per frame": "False alarms: detections that no path explains.",
+    "GOSPA [m]": "GOSPA (p = 2, alpha = 2, c = 5 m): distance of the confirmed tracks from the "
+    "truth; above \u201cNo tracks\u201d they are worse than none. Missed, false: UAVs and tracks "
+    "per frame.",
+    "n": "n: estimates caused by the UAV's own path within three resolution cells, the base of the "
+    "RMSE.",
+    "City loss": "City loss: noise-only detection probability less hit rate. Masked, clutter, not "
+    "read: target-frames lost behind a stronger path, to clutter, and with the data.",
+}
+"""What a column title means."""
+
+
+def legend(*tables: Table) -> str:
+    """Explain the columns of tables that have rows, each once."""
+    shown = {title for table in tables if table.rows for title in table.columns}
+    return " ".join(text for title, text in LEGEND.items() if title in shown)
+
+
 _RATES = {
     "SER delay": "ser_delay",
     "SER DPSK": "ser_dpsk",
     "BER": "ber",
-    "Undecided": "erased",
+    "Erased": "erased",
     "Bits": "bits",
     "Bit rate [kbit/s]": "bit_rate_bps",
-    "Hit rate": "hit_rate",
-    "Matched": "matched",
-    "Matched, tracked": "matched_tracked",
-    "False per frame": "false_per_frame",
 }
 
 
-def _rates(link: Mapping[str, Any], keys: Iterable[str]) -> list[str]:
-    """Figures of a link as text."""
-    values = {key: link[key] for key in keys}
-    if values.get("bit_rate_bps") is not None:
-        values["bit_rate_bps"] /= 1e3
-    return [number(value) for value in values.values()]
-
-
-def per_terminal(summary: Mapping[str, Any]) -> Table:
-    """Decoding and detection, one row for each link (and so for each terminal); what none of them
-    has, a sensor's data say, has no column."""
+def data_table(summary: Mapping[str, Any]) -> Table:
+    """Decoding of the links that carry data; no rows where none does."""
     rows = [
-        (link_words(name), s["role"], *_rates(s, _RATES.values()), *_waits(s.get("latency_frames")))
+        (
+            link_words(name),
+            *(number(s[key]) for key in list(_RATES.values())[:-1]),
+            number(None if s["bit_rate_bps"] is None else s["bit_rate_bps"] / 1e3),
+            *_waits(s.get("latency_frames")),
+        )
         for name, s in summary["links"].items()
+        if s["ser_delay"] is not None
     ]
-    titles = ("Link", "Role", *_RATES, "Data frames read", "Of these late", "Frames late, at most")
-    columns = zip(*rows, strict=True)
-    kept = [set(column) != {DASH} for column in columns]
-    return Table(tuple(compress(titles, kept)), [tuple(compress(row, kept)) for row in rows])
+    return Table(("Data", *_RATES, "Frames read", "Late", "Most frames late"), rows)
 
 
 def _waits(latency: Mapping[str, Any] | None) -> list[str]:
@@ -74,27 +92,78 @@ def _waits(latency: Mapping[str, Any] | None) -> list[str]:
     return [number(None if latency is None else latency[key]) for key in ("read", "late", "most")]
 
 
+def _parts(
+    summary: Mapping[str, Any], group: str
+) -> Iterator[tuple[str, Mapping[str, Any], Mapping[str, Any]]]:
+    """(link, its figures, those of the targets or of the terminals) where some were in view."""
+    for name, s in summary["links"].items():
+        part = s.get("apart", {}).get(group)
+        if part and part["in_view"]:
+            yield link_words(name), s, part
+
+
+def hit_table(summary: Mapping[str, Any], group: str) -> Table:
+    """Hit rate of ``targets`` or ``terminals`` by link, between its upper bounds and, of targets,
+    GOSPA with its parts."""
+    parts = {"GOSPA [m]": "total_m", "No tracks [m]": "empty_m", "Missed": "missed"}
+    parts |= {"False": "false"}
+    rows = [
+        (
+            link,
+            number(part["in_view"]),
+            number(part["hit_rate"]),
+            *(number(part["bounds"][key]) for key in ("clutter_free", "genie")),
+            *(
+                (number(s["false_per_frame"]), *(number(part["gospa"][k]) for k in parts.values()))
+                if "gospa" in part
+                else ()
+            ),
+        )
+        for link, s, part in _parts(summary, group)
+    ]
+    more = ("False alarms per frame", *parts) if group == "targets" else ()
+    titles = ("In view", "Hit rate", "Noise only", "Matched filter", *more)
+    return Table((group.capitalize(), *titles), rows)
+
+
+def rmse_table(summary: Mapping[str, Any], group: str) -> Table:
+    """RMSE of the detections and of the tracks of ``targets`` or ``terminals``, by link."""
+    rows = [
+        (f"{link}, {estimates}s", number(part[count]), *(number(v) for v in part[key].values()))
+        for link, _, part in _parts(summary, group)
+        if "rmse" in part
+        for estimates, count, key in (
+            ("detection", "detected", "rmse"),
+            ("track", "tracked", "rmse_tracked"),
+        )
+    ]
+    return Table((f"RMSE of {group}", "n", *_AXES), rows)
+
+
 def side_by_side(summary: Mapping[str, Any]) -> Table:
     """The scenario's own receivers and those compared with them on the same samples, link by link;
     no rows where none are compared."""
-    titles = {t: k for t, k in _RATES.items() if k not in ("bits", "bit_rate_bps")}
-    titles["False tracks per frame"] = "false_tracks_per_frame"
+    titles = list(_RATES)[:4]
     costs = summary["timing_s"].get("by_set", {})
-    rows = [
-        (
-            link_words(name),
-            set_name,
-            *_rates(link, titles.values()),
-            number(link["gospa"]["total_m"]),
-            number(costs[set_name][name]),
+    rows = []
+    for name, set_name, link in _sets(summary):
+        targets = link["apart"]["targets"]
+        values = (
+            *(link[_RATES[title]] for title in titles),
+            targets["in_view"],
+            targets["hit_rate"],
+            link["false_per_frame"],
+            link["false_tracks_per_frame"],
+            targets["gospa"]["total_m"],
+            costs[set_name][name],
         )
-        for name, set_name, link in _sets(summary)
-    ]
-    return Table(("Link", "Receivers", *titles, "GOSPA [m]", "Processor time [s]"), rows)
+        rows.append((link_words(name), set_name, *map(number, values)))
+    ends = ("In view", "Hit rate", "False alarms per frame", "False tracks per frame", "GOSPA [m]")
+    return Table(("Link", "Receivers", *titles, *ends, "Processor time [s]"), rows)
 
 
 def _sets(summary: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """(link, set of receivers, figures) where several sets heard the same samples."""
+    """(link, set of receivers, figures) where several sets received the same samples."""
     sets = {OWN: summary, **summary.get("compared", {})}
     for link in summary["links"]:
         for name, one in sets.items():
@@ -107,30 +176,26 @@ _CITY = ("ghost", "specular", "diffuse")
 
 
 def city_costs(summary: Mapping[str, Any]) -> Table:
-    """Tabulate what the city costs each set of receivers: what it finds, what it would find in
-    noise alone, what hides the rest, and what the city makes it believe; no rows where none are
-    compared."""
+    """Tabulate the targets that each set of receivers loses to the city, and the false tracks that
+    the city causes; no rows where none are compared."""
     causes = {"Masked": "masked", "Clutter": "clutter", "Not read": "not_read"}
     rows = []
     for link, name, one in _sets(summary):
-        alone, hits = one["bounds"]["clutter_free"], one["hit_rate"]
-        if hits is None or alone is None:
+        targets = one["apart"]["targets"]
+        noise_only, hits = targets["bounds"]["clutter_free"], targets["hit_rate"]
+        if hits is None or noise_only is None:
             continue
-        losses = (one["losses"][cause] for cause in causes.values())
-        false = sum(one["false_tracks"][kind] or 0.0 for kind in _CITY)
-        cost = number(round(alone - hits, 3))
-        figures = (number(one["counts"]["hit_rate"][1]), number(hits), number(alone), cost)
-        rows.append(
-            (
-                link_words(link),
-                name,
-                *figures,
-                *map(number, losses),
-                number(false),
-                number(one["ser_delay"]),
-            )
+        values = (
+            targets["in_view"],
+            hits,
+            noise_only,
+            round(noise_only - hits, 3),
+            *(targets["losses"][cause] for cause in causes.values()),
+            sum(one["false_tracks"][kind] or 0.0 for kind in _CITY),
+            one["ser_delay"],
         )
-    titles = ("In view", "Hit rate", "In noise alone", "The city costs", *causes)
+        rows.append((link_words(link), name, *map(number, values)))
+    titles = ("In view", "Hit rate", "Noise only", "City loss", *causes)
     ends = ("False tracks of the city", "SER delay")
     return Table(("Link", "Receivers", *titles, *ends), rows)
 
@@ -138,17 +203,6 @@ def city_costs(summary: Mapping[str, Any]) -> Table:
 def link_words(name: str) -> str:
     """AT to PT1, of AT->PT1."""
     return name.replace("->", " to ")
-
-
-def rmse_table(summary: Mapping[str, Any]) -> Table:
-    """RMSE of detections and of tracks."""
-    columns = ("RMSE", *_AXES)
-    rows = [
-        (f"{link_words(name)}, {word}", *(number(v) for v in s[key].values()))
-        for name, s in summary["links"].items()
-        for key, word in (("rmse", "detections"), ("rmse_tracked", "tracks"))
-    ]
-    return Table(columns, rows)
 
 
 _SEES = {
@@ -213,55 +267,9 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
     return limits, words, Table(titles, rows)
 
 
-def gospa_table(summary: Mapping[str, Any]) -> Table:
-    """GOSPA of each link's confirmed tracks with its parts."""
-    keys = {
-        "GOSPA [m]": "total_m",
-        "Empty picture [m]": "empty_m",
-        "Localisation [m]": "localisation_m",
-        "Missed": "missed",
-        "False": "false",
-    }
-    rows = [
-        (link_words(name), *(number(s["gospa"][key]) for key in keys.values()))
-        for name, s in summary["links"].items()
-        if "gospa" in s
-    ]
-    return Table(("Picture", *keys), rows)
-
-
-def apart_table(summary: Mapping[str, Any]) -> Table:
-    """Targets and terminals apart, with what could be found of them at most."""
-    rows = [
-        (
-            f"{link_words(name)}, {who}",
-            number(part["in_view"]),
-            number(part["hit_rate"]),
-            *(number(part["bounds"][key]) for key in ("clutter_free", "genie")),
-            *(
-                number(part["gospa"][key]) if "gospa" in part else DASH
-                for key in ("total_m", "empty_m")
-            ),
-        )
-        for name, s in summary["links"].items()
-        for who, part in s.get("apart", {}).items()
-        if part["in_view"]
-    ]
-    titles = (
-        "Apart",
-        "In view",
-        "Hit rate",
-        "Without clutter",
-        "Matched filter",
-        "GOSPA [m]",
-        "Empty picture [m]",
-    )
-    return Table(titles, rows)
-
-
 def swarm_table(summary: Mapping[str, Any]) -> Table:
-    """The pictures of terminals that cooperate, all of them together first; no rows where none
-    does."""
+    """The fused tracks of cooperating terminals, those of the whole swarm first; no rows where none
+    cooperate."""
     swarm = summary.get("swarm")
     if swarm is None:
         return Table((), ())
@@ -275,35 +283,35 @@ def swarm_table(summary: Mapping[str, Any]) -> Table:
             *(number(p[key]) for key in ("reports_per_frame", "age_s")),
             *_traffic(p, name in swarm["terminals"]),
         )
-        for name, p in {"All together": swarm, **swarm["terminals"]}.items()
+        for name, p in {"Whole swarm": swarm, **swarm["terminals"]}.items()
     ]
     titles = (
-        "Picture",
+        "Fused tracks",
         "Hit rate",
         "GOSPA [m]",
-        "Empty picture [m]",
+        "No tracks [m]",
         "Missed",
         "False",
         "Position [m]",
         "Velocity [m/s]",
         "NEES",
-        "Heard",
+        "Reports per frame",
         "Age [s]",
         "Left out",
-        "kbit of room",
+        "kbit sent",
         "Lost messages",
     )
     return Table(titles, rows)
 
 
-def _traffic(picture: Mapping[str, Any], told: bool) -> tuple[str, str, str]:
-    """Tabulate what the messages to a terminal left out, their bits, and those of them that were
-    lost."""
-    if not told:
+def _traffic(fused: Mapping[str, Any], receives: bool) -> tuple[str, str, str]:
+    """Count what the messages to a terminal left out, their bits and the capacity of its links, and
+    lost messages."""
+    if not receives:
         return DASH, DASH, DASH
-    bits = f"{number(picture['bits'] / 1e3)} of {number(picture['bits_room'] / 1e3)}"
-    lost = f"{picture['messages_lost']} of {picture['messages']}"
-    return number(picture["left_out"]), bits, lost
+    bits = f"{number(fused['bits'] / 1e3)} of {number(fused['bits_room'] / 1e3)}"
+    lost = f"{fused['messages_lost']} of {fused['messages']}"
+    return number(fused["left_out"]), bits, lost
 
 
 def false_table(summary: Mapping[str, Any]) -> Table:
@@ -322,32 +330,35 @@ def false_table(summary: Mapping[str, Any]) -> Table:
     return Table(("False tracks per frame", "All", *titles), rows)
 
 
-def _targets(summary: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """(link, UAV, figures) of what was in view at some time."""
-    for link, s in summary["links"].items():
-        for uav, t in s.get("targets", {}).items():
-            if t["in_view"]:
-                yield link_words(link), uav, t
+def _uavs(summary: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """(link, UAV, figures) of the UAVs that were in view at some time, targets before terminals."""
+    terminals = {end for link in summary["links"] for end in link.split("->")}
+    for group in (False, True):
+        for link, s in summary["links"].items():
+            for uav, t in s.get("targets", {}).items():
+                if t["in_view"] and (uav in terminals) == group:
+                    yield link_words(link), f"{uav} (terminal)" if group else uav, t
 
 
 def target_table(summary: Mapping[str, Any]) -> Table:
-    """Who saw whom, and how often."""
+    """The frames in which each UAV was in view, found and tracked."""
     keys = ("in_view", "found", "tracked", "switches")
-    rows = [(link, uav, *(number(t[key]) for key in keys)) for link, uav, t in _targets(summary)]
+    rows = [(link, uav, *(number(t[key]) for key in keys)) for link, uav, t in _uavs(summary)]
     return Table(("Link", "UAV", "In view", "Found", "Tracked", "Switches"), rows)
 
 
 def error_table(summary: Mapping[str, Any]) -> Table:
-    """Median and 90 % of the errors of each UAV, and beside them what no unbiased estimator goes
-    below; UAVs that were never found are left out."""
-    columns = ("Link", "UAV", "", *_AXES)
+    """Median and 90 % of the errors of each UAV, and the Cramer-Rao bound of both; UAVs that were
+    never found are left out."""
     rows = []
-    for link, uav, t in _targets(summary):
+    for link, uav, t in _uavs(summary):
         if any(middle is not None for middle in t["median"].values()):
-            rows.append((link, uav, "error", *_pairs(t["median"], t["p90"])))
+            rows.append(
+                (link, uav, "error", number(t.get("detected")), *_pairs(t["median"], t["p90"]))
+            )
             if "bound_median" in t:
-                rows.append((link, uav, "bound", *_pairs(t["bound_median"], t["bound_p90"])))
-    return Table(columns, rows)
+                rows.append((link, uav, "bound", "", *_pairs(t["bound_median"], t["bound_p90"])))
+    return Table(("Link", "UAV", "", "n", *_AXES), rows)
 
 
 _AXES = ("Range [m]", "Velocity [m/s]", "Azimuth [deg]", "Elevation [deg]")
@@ -363,7 +374,7 @@ def _pairs(middle: Mapping[str, float | None], most: Mapping[str, float | None])
 
 def loss_table(summary: Mapping[str, Any]) -> Table:
     """Tabulate the outcome of every target-frame in view; causes without frames are left out."""
-    rows = list(_targets(summary))
+    rows = list(_uavs(summary))
     causes = [c for c in LOSSES if any(t["losses"][c] for _, _, t in rows)]
     titles = (cause.replace("_", " ").capitalize() for cause in causes)
     return Table(

@@ -333,11 +333,11 @@ def test_titles_keep_their_units_on_the_screen(
     for unit in ("[m]", "[m/s]", "[deg]", "[kbit/s]", "[dBm]", "[dB]", "o [m] :smile:"):
         assert unit in said, unit
     words = set(said.split())
-    for word in ("Elevation", "Undecided", "processed", "received", "AT"):
+    for word in ("Elevation", "Erased", "processed", "received", "AT"):
         assert word in words, word
     assert "GOSPA" in words
-    assert "AT to PT1: of 13 UAVs in view 11 found, 2 inaccurate" in said
-    assert "AT to PT1: 0.143 false tracks a frame, by 0.143 target" in said
+    assert "AT to PT1: of 6 target-frames in view: 5 found, 1 inaccurate" in said
+    assert "AT to PT1: of 0.143 false tracks per frame: 0.143 target" in said
     if columns is not None:
         tables = [t for t in said.splitlines() if not t.startswith(("paths:", "results in"))]
         assert max(map(len, tables)) <= columns

@@ -212,5 +212,12 @@ def test_terminals_and_targets_apart():
     assert terminals["bounds"] == pytest.approx({"genie": 0.4, "clutter_free": 0.7})
     assert targets["gospa"]["total_m"] == pytest.approx(np.sqrt(12.5 / 3))
     assert targets["gospa"]["empty_m"] == pytest.approx(np.sqrt(12.5 * 2 / 3))
+    # errors of 1 and 3 cm of the target, of 5 cm of the terminal where both are in view
+    off = [row(errors=((0.01, 0, 0, 0), (0.05, 0, 0, 0))), row(errors=((0.03, 0, 0, 0), None))]
+    apart = sensing(off).block()["apart"]
+    assert [apart[group]["detected"] for group in ("targets", "terminals")] == [2, 1]
+    assert apart["targets"]["rmse"]["range_m"] == pytest.approx(np.sqrt(5e-4))
+    assert apart["terminals"]["rmse"]["range_m"] == pytest.approx(0.05)
+    assert apart["terminals"]["tracked"] == 0 and sum(apart["targets"]["losses"].values()) == 2
     bounds = sensing(rows).block()["bounds"]
     assert bounds["genie"] == pytest.approx((2 * 0.9 + 3 * 0.4) / 5)

@@ -166,7 +166,7 @@ def test_a_stopped_run_goes_on_to_the_same_pictures(told, tmp_path):
 
 def test_the_report_and_the_moving_picture_show_the_pictures(talked):
     table = swarm_table(talked.summary)
-    assert [row[0] for row in table.rows] == ["All together", "AT", "PT"]
+    assert [row[0] for row in table.rows] == ["Whole swarm", "AT", "PT"]
     assert table.rows[2][-1].startswith("0 of ")
     told = talked.summary["swarm"]["terminals"]["PT"]
     assert table.rows[2][-3] == str(told["left_out"]) and told["left_out"] > 0

@@ -13,7 +13,7 @@ import isac_rt as irt
 from isac_rt.results.provenance import run_content
 from isac_rt.simulation import simulate
 from isac_rt.simulation.resume import Resume
-from isac_rt.views.tables import per_terminal
+from isac_rt.views.tables import data_table
 
 SCENES = Path(__file__).parents[2] / "scenes"
 SHIFT = 1.0
@@ -78,7 +78,7 @@ def test_late_frames_are_amended(whole):
     pilots = whole.summary["compared"]["pilots"]["terminals"]
     assert pilots["PT2"]["latency_frames"]["read"] == 0
     assert pilots["PT1"]["latency_frames"]["read"] == 13
-    row = next(r for r in per_terminal(whole.summary).rows if r[0] == "AT to PT2")
+    row = next(r for r in data_table(whole.summary).rows if r[0] == "AT to PT2")
     assert list(row[-3:]) == [str(seen.sum()), str((late > 0).sum()), str(late.max())]
 
 

@@ -52,6 +52,7 @@ def test_all_figures_are_there_and_hold_ink(written):
         "tracks_AT",
         "tracks_PT1",
         "errors",
+        "errors_terminals",
         "paths",
         "decoding",
         "link",
@@ -143,14 +144,14 @@ def test_tracks_are_drawn_in_people_units_and_shadow_is_shaded(run):
     assert len(ax.patches) == 1
 
 
-def test_error_cdf_ends_at_one_and_leaves_the_observer_itself_out(run):
-    ax = error_cdf(Figure().subplots(), run.dataset, "range")
-    raw = next(line for line in ax.get_lines() if line.get_label().startswith("PT1 raw"))
-    assert (
-        raw.get_ydata()[-1] == 1
-        and len(raw.get_ydata()) == 13
-        and np.allclose(raw.get_xdata(), 0.0637, rtol=1e-9)
-    )
+def test_error_cdf_ends_at_one_and_keeps_targets_and_terminals_apart(run):
+    """PT1 detects U1 in 6 frames and the transmitter, which reports its position, in 7. Planted
+    bugs: all UAVs in both; the observer itself counted."""
+    for terminals, n in ((False, 6), (True, 7)):
+        ax = error_cdf(Figure().subplots(), run.dataset, "range", terminals)
+        raw = next(line for line in ax.get_lines() if line.get_label().startswith("PT1 detected"))
+        assert raw.get_label().endswith(f"(n = {n})") and len(raw.get_ydata()) == n
+        assert raw.get_ydata()[-1] == 1 and np.allclose(raw.get_xdata(), 0.0637, rtol=1e-9)
 
 
 def test_every_kind_has_its_own_colour():

@@ -14,11 +14,13 @@ from fake_run import fake_run
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.views.report import wall_table, write_report
 from isac_rt.views.tables import (
+    data_table,
     error_table,
     false_table,
-    gospa_table,
+    hit_table,
+    legend,
     loss_table,
-    per_terminal,
+    rmse_table,
     target_table,
 )
 from isac_rt.world.city import load_city
@@ -48,17 +50,36 @@ def test_who_saw_what(summary):
     bound = row(error_table(summary), "AT to PT1", "U1", "bound")
     assert bound["Range [m]"] == "0.0027 / 0.0066"
     assert row(table, "AT to AT", "U1")["In view"] == "3"
-    assert {r[1] for r in table.rows} == {"AT", "U1"}
+    assert [r[1] for r in table.rows] == ["U1", "U1", "AT (terminal)"]
 
 
-def test_a_sensor_decodes_nothing(summary):
-    """Without data there are no columns of data, and those of sensing stay. Planted bug: a column
-    goes when one link has nothing in it: the AT's own has no symbols."""
-    assert {"SER delay", "Hit rate"} <= set(per_terminal(summary).columns)
+def test_a_sensor_has_no_data_and_no_legend_of_data(summary):
+    """Planted bug: the active terminal's own link as one that carries data."""
+    table = data_table(summary)
+    assert [r[0] for r in table.rows] == ["AT to PT1"]
+    assert "SER" in legend(table) and "Hit rate" not in legend(table)
     name, own = next((n, s) for n, s in summary["links"].items() if s["ser_delay"] is None)
-    alone = per_terminal({"links": {name: own}})
-    assert "SER delay" not in alone.columns and "Bits" not in alone.columns
-    assert row(alone, "AT to AT")["Hit rate"] == row(per_terminal(summary), "AT to AT")["Hit rate"]
+    alone = {"links": {name: own}}
+    assert not data_table(alone).rows
+    said = legend(data_table(alone), hit_table(alone, "targets"))
+    assert "SER" not in said and "Hit rate" in said
+
+
+def test_targets_and_terminals_are_scored_apart_with_their_numbers(summary):
+    """PT1 found U1 in five frames of its six in view, 6.37 cm off in range; the transmitter, which
+    reports its position, has rows of its own. Planted bugs: all UAVs in both; the tracks' number
+    for the detections."""
+    block = summary["links"]["AT->PT1"]["apart"]
+    for group, n in (("targets", "6"), ("terminals", "7")):
+        found = row(hit_table(summary, group), "AT to PT1")
+        assert found["In view"] == n == str(block[group]["in_view"])
+        errors = row(rmse_table(summary, group), "AT to PT1, detections")
+        assert errors["n"] == str(block[group]["detected"])
+        assert errors["Range [m]"] == "0.0637"
+    assert row(hit_table(summary, "targets"), "AT to PT1")["Hit rate"] == "0.833"
+    assert "GOSPA [m]" not in hit_table(summary, "terminals").columns
+    tracks = row(rmse_table(summary, "targets"), "AT to PT1, tracks")
+    assert tracks["n"] == str(block["targets"]["tracked"])
 
 
 def test_walls_behind_what_was_seen():
@@ -102,9 +123,8 @@ def test_why_not(summary):
 
 def test_picture(summary):
     """In frame 4 the track of U1 follows nobody in view."""
-    gospa, false = gospa_table(summary), false_table(summary)
-    assert row(gospa, "AT to PT1")["Localisation [m]"] == "0.3"
-    assert row(gospa, "AT to PT1")["False"] == "0.143"
+    hits, false = hit_table(summary, "targets"), false_table(summary)
+    assert row(hits, "AT to PT1")["False"] == "0.143"
     assert row(false, "AT to PT1") == {
         "False tracks per frame": "AT to PT1",
         "All": "0.143",
@@ -115,11 +135,12 @@ def test_picture(summary):
 def test_summaries_of_earlier_versions_have_none(summary):
     old = copy.deepcopy(summary)
     for block in old["links"].values():
-        for key in ("gospa", "false_tracks", "targets"):
+        for key in ("apart", "false_tracks", "targets"):
             del block[key]
-    tables = gospa_table, false_table, target_table, error_table, loss_table
-    for table in tables:
+    for table in (false_table, target_table, error_table, loss_table):
         assert not table(old).rows
+    for group in ("targets", "terminals"):
+        assert not hit_table(old, group).rows and not rmse_table(old, group).rows
 
 
 def test_tables_fit_the_page(summary):
@@ -133,8 +154,8 @@ def test_tables_fit_the_page(summary):
             target["losses"] = dict.fromkeys(target["losses"], 1234)
             for key in ("median", "p90", "bound_median", "bound_p90"):
                 target[key] = dict.fromkeys(target[key], 0.00012345)
-    for table in (gospa_table, false_table, target_table, error_table, loss_table):
-        found = table(full)
+    for table in (hit_table, rmse_table, false_table, target_table, error_table, loss_table):
+        found = table(full, "targets") if table in (hit_table, rmse_table) else table(full)
         cells = zip(found.columns, *found.rows, strict=True)
         width = sum(max(map(len, column)) * 7.5 + 22 for column in cells)
         assert width < 1200, table.__name__
