@@ -160,6 +160,11 @@ class Plan:
         """Farthest from its terminal that a surface can be heard [m]."""
         return self.longest_delay * SPEED_OF_LIGHT / 2
 
+    @property
+    def whole_mesh(self) -> bool:
+        """Whether the mesh is not cut to `mesh_radius`."""
+        return self.preset == "everything" or self.propagation.model != "ray_traced"
+
     def mesh_radius(self, centre: np.ndarray) -> float:
         """A surface farther than this from a place takes part in nothing that is heard, whole
         metres [m].
@@ -167,10 +172,7 @@ class Plan:
         All points of a path of length L, what shadows it included, lie within L/2 of the middle
         between its ends, which is no farther from the place than the farther end. What moves during
         a frame adds its way. The field of view cuts nothing: a second wall may stand outside it.
-        Infinite where nothing is to be left out.
         """
-        if self.preset == "everything" or self.propagation.model != "ray_traced":
-            return float(np.inf)
         terminals = [name for name, uav in self.swarm.uavs.items() if uav.role != "target"]
         times = map(self.timetable.epoch, range(self.timetable.frames))
         poses = [self.swarm.poses(time) for time in times]

@@ -20,6 +20,7 @@ from isac_rt.scenario.tree import NEAREST_M
 from isac_rt.simulation.coverage import Coverage, Outside, unambiguous_velocity
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.passage import TOUCH_M, enclosed, first_passage
+from isac_rt.world.settings import City
 from isac_rt.world.swarm import Pose, Swarm
 
 SAMPLE_BYTES = 8
@@ -134,6 +135,38 @@ def check_passage(swarm: Swarm, timetable: Timetable, city: CityMesh) -> None:
                 f"swarm.{name}: flies through a surface of {city.name} ({made_of}) at {when:.3g} s "
                 f"(frame {int(when / timetable.interval)}), at {_said(where)} m; change its {keys}"
             )
+
+
+def check_reach(settings: City | None, city: CityMesh, reach: float) -> None:
+    """Refuse a city that lies elsewhere, and warn of its doubts.
+
+    Parameters
+    ----------
+    city : the whole of it, about the middle of the flights
+    reach : distance from there beyond which a surface takes part in nothing [m]
+
+    Raises
+    ------
+    ScenarioError
+    """
+    for doubt in city.doubts:
+        _warn(f"city: {doubt}")
+    if settings is None or not city.num_faces or city.within(reach).num_faces:
+        return
+    low, high = city.bounds() + city.origin
+    said = (
+        f"city: nothing of {city.name} is within {reach:.0f} m of the middle of the flights, "
+        f"{_said(city.origin)} m; it reaches from {_said(low)} to {_said(high)} m"
+    )
+    if ((low <= city.origin) & (city.origin <= high))[:2].all():
+        return _warn(f"{said}; fly lower")
+    as_in_file = settings.source == "mesh" and settings.scale == 1 and settings.up_axis != "y"
+    point = np.append((low + high)[:2] / 2, low[2]) + (settings.origin or 0.0)
+    example = f", such as {_said(point.round())}" if as_in_file else ""
+    raise ScenarioError(
+        f"{said}; state as city.origin the point of a mesh or of footprints that becomes the "
+        f"world's origin{example}, or move the swarm"
+    )
 
 
 def _off_the_ends(way: np.ndarray) -> np.ndarray:

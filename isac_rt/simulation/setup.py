@@ -47,6 +47,7 @@ from isac_rt.simulation.preflight import (
     check_flights,
     check_memory,
     check_passage,
+    check_reach,
     check_reference,
     warn_of_aliases,
     warn_of_unseen,
@@ -424,12 +425,16 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
     check_reference(scenario.noise, scenario.clutter, swarm, timetable)
     plan = plan_of(scenario, antennas, timetable, swarm)
     # the blocks, and with them the reach, are found out in the run where links are established
-    radius = np.inf if scenario.access.establish else plan.mesh_radius(swarm.middle)
+    reach = plan.mesh_radius(swarm.middle)
+    radius = np.inf if scenario.access.establish or plan.whole_mesh else reach
     carrier = waveform.carrier_frequency
     digest = city_digest(scenario.city, scenario.folder) if digest is None else digest
     about = swarm.middle, scenario.city, scenario.folder, carrier
     city = city_about(*about, radius, digest)
-    check_passage(swarm, timetable, city_about(*about, digest=digest))
+    whole = city_about(*about, digest=digest)
+    check_passage(swarm, timetable, whole)
+    if scenario.propagation.model == "ray_traced":
+        check_reach(scenario.city, whole, reach)
     warn_of_aliases(
         swarm, timetable, antennas, scenario.receivers.velocity_method, scenario.schedule
     )

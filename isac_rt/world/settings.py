@@ -76,10 +76,12 @@ class City(Node):
     lod: Annotated[float, Field(ge=0, le=4)] | None = None
     """Highest level of detail that is taken of CityJSON, such as 1.2, without unit; a lower level
     has fewer faces. By default the highest that there is."""
-    up_axis: Literal["y", "z"] = "z"
-    """Axis of a `mesh` file that points up. The default is z; glTF has y by its standard."""
+    up_axis: Literal["auto", "y", "z"] = "auto"
+    """Axis of a `mesh` file that points up. `auto`, the default, is y for glTF, as its standard
+    has it, and z for all others, with a warning where the mesh seems to lie on its side."""
     scale: Positive = 1.0
-    """Metres per unit of a `mesh` file. By default the file is in metres."""
+    """Metres per unit of a `mesh` file: 0.001 where it is in millimetres. By default the file is in
+    metres."""
     material: str = "concrete"
     """Material of the pieces of a `mesh` that neither `material_map` nor their names tell. The
     default, concrete, is the most common."""
@@ -96,9 +98,9 @@ class City(Node):
     the file says. Grids in true metres are kept, all others projected about the origin. By default
     what the file says, else told by the size of its numbers."""
     origin: Vector | None = None
-    """Point of a `footprints` file [x, y, z] that becomes the world's origin, in the coordinates of
-    the file (metres, or longitude and latitude in degrees) and with a height in metres. By default
-    that of the file where it is in metres, else the middle of the buildings at height 0."""
+    """Point of a `footprints` or `mesh` file [x, y, z] that becomes the world's origin, in the
+    coordinates and units of the file. By default that of the file; of footprints in longitude and
+    latitude the middle of the buildings at height 0."""
     terrain: str | None = None
     """Path of a GeoTIFF with heights of the ground [m], relative to the scenario's folder, for
     `footprints`; needs the extra `cities`. By default the relief of CityJSON, else a ground that is
@@ -187,7 +189,7 @@ _SURFACES = frozenset({"wall_material", "roof_material", "ground_material", "gro
 CITY_KEYS: dict[str, frozenset[str]] = {
     "builtin": frozenset({"name"}),
     "mitsuba": frozenset({"file"}),
-    "mesh": frozenset({"file", "up_axis", "scale", "material", "material_map"}),
+    "mesh": frozenset({"file", "up_axis", "scale", "origin", "material", "material_map"}),
     "footprints": frozenset(
         {
             "file",

@@ -141,7 +141,7 @@ def test_the_reach_follows_the_groups():
             1.6, abs=1.2
         )  # whole metres, a metre, the way in a frame
     free = district(314, propagation={"model": "free_space"}, city=None, clutter={"model": "none"})
-    assert prepare(free).plan.mesh_radius(np.zeros(3)) == np.inf
+    assert prepare(free).plan.whole_mesh
     everything = prepare(district(314, accuracy={"preset": "everything"}))
     assert everything.city.num_beyond == 0
 

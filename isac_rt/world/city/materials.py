@@ -31,6 +31,7 @@ Sens. 32(4), 1994,
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -200,6 +201,14 @@ def canonical_name(name: str) -> str | None:
     short = short.replace("-", "_").replace(" ", "_")
     short = _ALIASES.get(short, short)
     return short if short in _SCATTERING else None
+
+
+def material_within(name: str) -> str | None:
+    """The table's name that is among the words of a name (``wet_ground_P.527`` -> ``wet_ground``),
+    the longest of several; None if there is none."""
+    words = f"_{re.sub('[^a-z]+', '_', name.lower())}_"
+    found = [known for known in (*KNOWN_MATERIALS, *_ALIASES) if f"_{known}_" in words]
+    return canonical_name(max(found, key=len)) if found else None
 
 
 def water_permittivity(frequency: float, temperature_c: float = 20.0) -> complex:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from isac_rt.kernels import world_mesh
 from isac_rt.kernels.jit import twin_of
 from isac_rt.storage import kept
+from isac_rt.world.city.heights import HIGHEST_M
 from isac_rt.world.city.materials import CityError, Material, MaterialUse
 from isac_rt.world.city.place import Place
 
@@ -24,6 +25,8 @@ PLANE_TOLERANCE = 1e-6
 FACES_KEPT = 3000
 """The planes of fewer faces are found in less time than it takes to read them."""
 MAX_FACES = 10_000_000
+SMALLEST_M = 2.0
+"""Size below which a city raises a doubt [m]."""
 MAX_COORDINATE = 1e8
 """Farther out float64 places no corner to a wavelength's phase, and no map has it. [m]"""
 
@@ -72,6 +75,8 @@ class CityMesh:
         Distance from the origin beyond which faces matter to nothing [m].
     place : Place or None
         Where it lies on Earth, of cities from maps.
+    doubts : tuple of str
+        Questions to the user: what looks as if it were meant otherwise.
     """
 
     name: str
@@ -85,6 +90,7 @@ class CityMesh:
     num_beyond: int = 0
     reach: float = np.inf
     place: Place | None = None
+    doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for array in (self.vertices, self.faces, self.face_material, self.origin):
@@ -165,7 +171,7 @@ class CityMesh:
     def within(self, radius: float) -> CityMesh:
         """The faces that come as near to the origin as `radius` [m], whole; their part beyond it
         scatters nothing (`reach`)."""
-        if not (np.isfinite(radius) and self.num_faces):
+        if radius >= self.reach or not self.num_faces:
             return self
         corner = np.linalg.norm(self.corners, axis=2)
         if (corner <= radius).all():
@@ -286,6 +292,29 @@ def check_coordinates(coordinates: NDArray[np.float64], what: str) -> None:
             f"{what}: a coordinate is {farthest:.3g} m from the origin, and no place is beyond "
             f"{MAX_COORDINATE:g} m; correct it, or its scale"
         )
+
+
+def check_size(corners: NDArray[np.float64], name: str, may_lie: bool) -> list[str]:
+    """Return doubts about the size of a city, by the corners (F, 3, 3) of its faces [m], and, where
+    it `may_lie` on its side, about its upright; refuse walls that nobody builds."""
+    remedy = "city.scale: 0.001 where its unit is the millimetre, 0.01 the centimetre, 1000 the km"
+    doubts, size = [], np.ptp(corners.reshape(-1, 3), axis=0)
+    normals = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    lengths = np.linalg.norm(normals, axis=1)
+    walls = np.ptp(corners[..., 2], axis=1)[normals[:, 2] < 0.5 * lengths]
+    if (highest := walls.max(initial=0.0)) > HIGHEST_M:
+        raise CityError(f"{name}: a wall is {highest:.0f} m high, which no building is; {remedy}")
+    if size[2] > HIGHEST_M or size.max() < SMALLEST_M:
+        written = " x ".join(f"{value:.3g}" for value in size)
+        doubts.append(f"{name} is {written} m large; is it in metres? {remedy}")
+    # a city is flat, and most of what is level and lowest is its ground and floors
+    level = normals > 0.99 * lengths[:, None]
+    lowest = corners.max(axis=1) - corners.min(axis=(0, 1)) < 0.01 * size
+    base = np.where(level & lowest, normals, 0.0).sum(axis=0)
+    flat = not base[1:].any() and 2 * size[1] < min(size[0], size[2])
+    if may_lie and size[1] < size[2] and (base[1] > 2 * base[2] or flat):
+        doubts.append(f"{name} seems to lie on its side; is city.up_axis: y meant, or z?")
+    return doubts
 
 
 def _merged(surfaces: Sequence[Surface], name: str) -> tuple[NDArray, NDArray, NDArray]:

@@ -20,8 +20,9 @@ from pydantic_core import from_json
 
 from isac_rt.world import settings
 from isac_rt.world.city.files import beside, read_bytes
-from isac_rt.world.city.materials import CityError, MaterialUse, canonical_name
+from isac_rt.world.city.materials import CityError, MaterialUse, canonical_name, material_within
 from isac_rt.world.city.mesh import MAX_FACES, Surface, gathered
+from isac_rt.world.city.place import Place
 
 logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else it prints tracebacks
 _MAX_PROPERTIES = 200
@@ -311,34 +312,55 @@ def mesh_files(path: Path) -> list[Path]:
     return list(dict.fromkeys([path, *(file for file in named if file is not None)]))
 
 
-def _use(labels: tuple[str, ...], city: settings.City) -> MaterialUse | None:
-    """The material of a piece; None if no name of it says."""
+def _use(
+    labels: tuple[str, ...], city: settings.City, file: str, guessed: Counter[str]
+) -> MaterialUse | None:
+    """The material of a piece; None if no name of it says, which that of the file is not. Names
+    that only hold one of a material are counted."""
     for label in labels:
         if label in city.material_map:
             return MaterialUse(city.material_map[label])
-    known = (canonical_name(label) for label in reversed(labels))
-    name = next((name for name in known if name is not None), None)
-    return None if name is None else MaterialUse(name)
+    own = [label for label in reversed(labels) if label != file]
+    for label in own:
+        if (name := canonical_name(label)) is not None:
+            return MaterialUse(name)
+    for label in own:
+        if (name := material_within(label)) is not None:
+            guessed[f"{label[:60]} as {name}"] += 1
+            return MaterialUse(name)
+    return None
 
 
-def mesh_file(city: settings.City, path: Path) -> tuple[list[Surface], list[str]]:
-    """The surfaces of a mesh file in world coordinates: node transforms applied, then scaled, then
-    turned z-up.
+def _listed(names: Counter[str], unit: str) -> str:
+    """Names with their counts, the most frequent first."""
+    listed = [f"{name[:80]} ({count} {unit})" for name, count in names.most_common(_NAMED)]
+    rest = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return f"{', '.join(listed)}{rest}; city.material_map says what they are"
+
+
+def mesh_file(
+    city: settings.City, path: Path
+) -> tuple[list[Surface], list[str], Place | None, bool]:
+    """The surfaces of a mesh file in world coordinates: node transforms applied, then taken from
+    `city.origin`, scaled, and turned z-up; with notes, the place of the origin, and whether z is up
+    by assumption.
 
     A piece's material is what `material_map` says of its node, geometry or material name, else a
     known material of that name, else `material`."""
-    seen, notes, unknown = set[str](), list[str](), Counter[str]()
+    seen, notes, unknown, guessed = set[str](), list[str](), Counter[str](), Counter[str]()
+    gltf, origin = path.suffix.lower() in (".glb", ".gltf"), city.origin or (0.0, 0.0, 0.0)
+    y_up = city.up_axis == "y" or (city.up_axis == "auto" and gltf)
 
     def surfaces() -> Iterator[Surface]:
         for piece in pieces(path):
             if not len(piece.faces):
                 notes.append(f"{piece.labels[0]}: no triangles, left out")
                 continue
-            vertices = piece.vertices * city.scale
-            if city.up_axis == "y":
+            vertices = (piece.vertices - origin) * city.scale
+            if y_up:
                 vertices = vertices @ _Y_UP_TO_Z_UP.T
             seen.update(piece.labels)
-            use = _use(piece.labels, city)
+            use = _use(piece.labels, city, path.name, guessed)
             if use is None:
                 unknown[piece.labels[-1] if piece.labels else "no name"] += len(piece.faces)
             yield Surface(vertices, piece.faces, use or MaterialUse(city.material))
@@ -353,12 +375,12 @@ def mesh_file(city: settings.City, path: Path) -> tuple[list[Surface], list[str]
             f"it has {', '.join(sorted(seen)) or 'no names'}"
         )
     if unknown:
-        named = [f"{name[:60]} ({count} faces)" for name, count in unknown.most_common(_NAMED)]
-        rest = f" and {len(unknown) - _NAMED} more" if len(unknown) > _NAMED else ""
-        notes.append(
-            f"names that are no known material became {city.material}: {', '.join(named)}{rest}; "
-            "city.material_map says what they are"
-        )
-    if path.suffix.lower() in (".glb", ".gltf") and city.up_axis == "z":
+        said = f"names that are no known material became {city.material}"
+        notes.append(f"{said}: {_listed(unknown, 'faces')}")
+    if guessed:
+        said = "names that hold that of a known material are taken for it"
+        notes.append(f"{said}: {_listed(guessed, 'pieces')}")
+    if gltf and not y_up:
         notes.append("glTF is y-up by its standard, and city.up_axis is z")
-    return found, notes
+    plain = city.origin is not None and city.scale == 1 and not y_up
+    return found, notes, Place("", origin) if plain else None, city.up_axis == "auto" and not gltf

@@ -24,6 +24,7 @@ from isac_rt.world.city.materials import (
     Material,
     MaterialUse,
     canonical_name,
+    material_within,
 )
 from isac_rt.world.city.mesh import Surface, gathered
 from isac_rt.world.city.meshfiles import Piece, pieces
@@ -153,7 +154,9 @@ def transform_of(reader: _Reader, shape: ET.Element) -> NDArray[np.float64]:
     return total
 
 
-def _material(reader: _Reader, city: settings.City, bsdf: ET.Element) -> MaterialUse:
+def _material(
+    reader: _Reader, city: settings.City, bsdf: ET.Element, notes: list[str]
+) -> MaterialUse:
     name = reader.text(bsdf, "id") or ""
     if name in city.material_map:
         return MaterialUse(city.material_map[name])
@@ -170,10 +173,10 @@ def _material(reader: _Reader, city: settings.City, bsdf: ET.Element) -> Materia
             f"{reader.path.name}: <bsdf id={name!r}>: {first['loc'][0]}: {first['msg']}; correct it"
         ) from None
     thickness = numbers.thickness_m
-    if bsdf.get("type") == "radio-material":
+    if bsdf.get("type") == "radio-material" and numbers.relative_permittivity is not None:
         defined = Material(
             name,
-            numbers.relative_permittivity or 1.0,
+            numbers.relative_permittivity,
             numbers.conductivity_s_per_m or 0.0,
             numbers.scattering_coefficient or 0.0,
             "lambertian",
@@ -184,10 +187,12 @@ def _material(reader: _Reader, city: settings.City, bsdf: ET.Element) -> Materia
         return MaterialUse(name, defined=defined)
     kind = bsdf.find("string[@name='type']")
     wanted = name if kind is None else reader.text(kind, "value") or name
-    short = name.removeprefix("mat-")
-    if canonical_name(wanted) is None and short in city.materials:
+    short, known = name.removeprefix("mat-"), canonical_name(wanted)
+    if known is None and short in city.materials:
         wanted = short
-    return MaterialUse(canonical_name(wanted) or wanted, thickness)
+    elif known is None and (known := material_within(wanted)):
+        notes.append(f"{name[:60]} without numbers, and no known material, became {known}")
+    return MaterialUse(known or wanted, thickness)
 
 
 @lru_cache(maxsize=1)
@@ -234,13 +239,14 @@ def mitsuba_file(city: settings.City, path: Path) -> tuple[list[Surface], list[s
     """
     reader = _Reader.of(path)
     by_id = {str(b.get("id")): b for b in reader.root.findall("bsdf")}
+    notes = list[str]()
     read = cache(lambda file: list(pieces(file, _MESHES)))
-    known = cache(lambda key: _material(reader, city, by_id[key]))
+    known = cache(lambda key: _material(reader, city, by_id[key], notes))
 
     def use(shape: ET.Element) -> MaterialUse:
         own = shape.find("bsdf")
         if own is not None:
-            return _material(reader, city, own)
+            return _material(reader, city, own, notes)
         keys = (reader.text(ref, "id") for ref in shape.findall("ref"))
         key = next((key for key in keys if key in by_id), None)
         return MaterialUse(city.material) if key is None else known(key)
@@ -263,7 +269,7 @@ def mitsuba_file(city: settings.City, path: Path) -> tuple[list[Surface], list[s
     found = gathered(surfaces(), path.name)
     if not found:
         raise CityError(f"{path.name}: there is no shape in it; export the scene with its meshes")
-    return found, []
+    return found, notes
 
 
 def builtin_path(name: str) -> Path:

@@ -15,7 +15,7 @@ from isac_rt.registry import CITY_SOURCES
 from isac_rt.world import settings
 from isac_rt.world.city.files import needs_extra
 from isac_rt.world.city.materials import CityError, resolve_materials
-from isac_rt.world.city.mesh import CityMesh, Surface, clean, empty_city
+from isac_rt.world.city.mesh import CityMesh, Surface, check_size, clean, empty_city
 from isac_rt.world.city.meshfiles import mesh_file, mesh_files
 from isac_rt.world.city.mitsuba_xml import builtin_path, mitsuba_file, mitsuba_files
 from isac_rt.world.city.place import Place
@@ -81,12 +81,14 @@ class CityParts:
     surfaces : in world coordinates, not yet cleaned
     notes : what was left out or assumed, for the report
     place : where on Earth the city's origin lies; None where the source does not say
+    may_lie : on its side, for the source does not say which axis is up
     """
 
     name: str
     surfaces: list[Surface]
     notes: list[str] = field(default_factory=list)
     place: Place | None = None
+    may_lie: bool = False
 
 
 def _map_reader(module: str, path: Path) -> Any:
@@ -189,4 +191,5 @@ def load_city(
         tolerance,
         reach=city.keep_radius_m or np.inf,
         place=parts.place,
+        doubts=tuple(check_size(vertices[faces], parts.name, parts.may_lie)),
     )
