@@ -162,7 +162,7 @@ class Plan:
 
     @property
     def whole_mesh(self) -> bool:
-        """Whether the mesh is not cut to `mesh_radius`."""
+        """Return whether the mesh is left whole, not cut to `mesh_radius`."""
         return self.preset == "everything" or self.propagation.model != "ray_traced"
 
     def mesh_radius(self, centre: np.ndarray) -> float:
