@@ -175,3 +175,21 @@ def test_names_within_those_of_a_mesh_tell_its_materials(tmp_path):
     )
     assert sorted(m.name for m in city.materials) == ["brick", "glass", "metal"]
     assert any("brick_wall as brick" in note for note in city.notes)
+
+
+def test_instances_of_a_group_stand_where_they_are_put(tmp_path):
+    """A group is drawn once for each instance, in its transform after its own, and not where it is
+    defined. Planted bug: the two transforms in the other order."""
+    (tmp_path / "a.xml").write_text(
+        """<scene version="2.1.0"><bsdf type="diffuse" id="mat-itu_wood"/>
+        <shape type="shapegroup" id="tree"><shape type="cube" id="crown"><ref id="mat-itu_wood"/>
+          <transform name="to_world"><translate x="1" z="4"/></transform></shape></shape>
+        <shape type="instance"><ref id="tree"/>
+          <transform name="to_world"><scale value="2"/><translate x="30"/></transform></shape>
+        <shape type="instance"><ref id="tree"/>
+          <transform name="to_world"><translate y="-9"/></transform></shape></scene>"""
+    )
+    city = load_city(City(source="mitsuba", file="a.xml"), tmp_path, 77e9, (0, 0, 0))
+    middles = sorted(city.corners[i : i + 12].mean(axis=(0, 1)).tolist() for i in (0, 12))
+    assert np.array(middles) == pytest.approx(np.array([[1, -9, 4], [32, 0, 8]]))
+    assert city.areas.sum() == pytest.approx(24 + 4 * 24)

@@ -544,3 +544,32 @@ def test_heights_of_national_tables(tmp_path, said, height):
     node = scenario.City.model_validate({"source": "footprints", "file": "f.geojson"})
     low, high = load_city(node, tmp_path, 77e9, (0.0, 0.0, 0.0)).bounds()
     assert high[2] - low[2] == pytest.approx(height)
+
+
+# ---- what other tools call it
+
+
+@pytest.mark.parametrize("name", ["Hoehe_m", "HEIGHT_M", "hauteur", "bldg_hgt", "altezza_vol"])
+def test_heights_under_another_name_are_suggested(tmp_path, name):
+    """Where most buildings have none by the known names. Planted bug: the ground's height."""
+    houses = [
+        feature([square(40 * i, 0, 20)], **{name: 12.0 + i, "ground_height": 520.0, "id": i})
+        for i in range(3)
+    ]
+    written(tmp_path, *houses)
+    assert said(read(tmp_path), f"city.height_property: {name}")
+    assert read(tmp_path, height_property=name).bounds()[1, 2] == 14.0
+    assert not said(read(tmp_path, height_property=name), "looks like")
+    written(tmp_path, feature([square(0, 0, 20)], **{"height": 9, name: 12.0}))
+    assert not said(read(tmp_path), "looks like")
+
+
+@pytest.mark.parametrize("tags", [{"is_underground": True}, {"location": "underground"}])
+def test_underground_buildings_are_left_out(tmp_path, tags):
+    """Also of Overture, whose buildings have no building tag; its False is no underground."""
+    houses = [feature([square(0, 0, 20)], height=30.0, num_floors=None, **tags)]
+    houses.append(feature([square(50, 0, 20)], height=21.5, is_underground=False))
+    written(tmp_path, *houses)
+    city = read(tmp_path)
+    assert city.bounds()[1, 2] == 21.5
+    assert said(city, "left out", "1 underground")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -30,6 +31,11 @@ MOST_COVERED = 0.5
 """Building parts replace an outline of which they cover at least this share; else both stand."""
 _HEIGHTS = ("height", "building:height", "est_height", "measuredHeight", "gesamthoehe")
 """Keys of heights beside the scenario's own: OpenStreetMap's, CityGML's, swissBUILDINGS3D's."""
+_CALLED_HEIGHT = re.compile(
+    r"height|hgt|hoe?he|höhe|hoogte|hauteur|altura|altezza|wysoko|^h(_?m)?$|_h$|^h_", re.IGNORECASE
+)
+_OTHER_HEIGHT = re.compile(r"min|base|ground|roof|sea|above|boden|sol$|terrain|unit", re.IGNORECASE)
+"""Heights of something else than of a building's top over its ground."""
 _NO = ("no", "none", "false", "0", "")
 _HSTORE = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
@@ -213,7 +219,21 @@ def buildings(
         said = notes[-1] if left else "it holds nothing"
         raise CityError(f"{name}: there is no polygon of a building in it ({said}); give buildings")
     heights.tell(len(found) + len(parts), notes)
+    missing = sum(outline.height is None for outline in (*found, *parts))
+    if 2 * missing > len(found) + len(parts) and (name := _likely_height(tags)):
+        notes.append(f"{name!r} looks like a height: is city.height_property: {name} meant?")
     return [*_without_parts(found, parts, notes), *parts]
+
+
+def _likely_height(tags: Sequence[Tags]) -> str | None:
+    """Return the property that is called a height in some language and is one in most features."""
+    found = Counter[str]()
+    for name, value in (item for own in tags for item in own.items()):
+        if _CALLED_HEIGHT.search(str(name)) and not _OTHER_HEIGHT.search(str(name)):
+            with suppress(ValueError):
+                found[str(name)] += bool(parse_length(value))
+    name, count = found.most_common(1)[0] if found else ("", 0)
+    return name[:60] if 2 * count > len(tags) else None
 
 
 def _most(left: Counter[str]) -> int:
@@ -224,9 +244,10 @@ def _no_building(feature: Feature, tags: Tags, city: settings.City, mapped: bool
     """Return what a feature is that is no building; None if it is one."""
     if feature.shape.is_empty:
         return "without a polygon"
+    if _says(tags, "is_underground") or tags.get("location") == "underground":
+        return "underground"
     if _says(tags, "building") or _says(tags, "building:part"):
-        under = tags.get("location") == "underground" or _says(tags, "tunnel")
-        return "underground" if under else None
+        return "underground" if _says(tags, "tunnel") else None
     other = next((key for key in OTHER_KEYS if isinstance(tags.get(key), str)), None)
     if mapped:
         return f"of {other}" if other else "without a building tag"

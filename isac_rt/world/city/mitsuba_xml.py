@@ -154,6 +154,28 @@ def transform_of(reader: _Reader, shape: ET.Element) -> NDArray[np.float64]:
     return total
 
 
+def _placed(
+    reader: _Reader,
+    parent: ET.Element,
+    place: NDArray[np.float64],
+    groups: dict[str, ET.Element] | None,
+) -> Iterator[tuple[ET.Element, NDArray[np.float64]]]:
+    """Yield the shapes under an element with their transforms (4, 4), those of one of the `groups`
+    once for each instance; None: within a group, which holds no instance."""
+    for shape in parent.findall("shape"):
+        kind, own = shape.get("type"), place @ transform_of(reader, shape)
+        if kind == "instance" and groups is not None:
+            keys = [reader.text(ref, "id") or "" for ref in shape.findall("ref")]
+            named = [*shape.findall("shape"), *(groups[key] for key in keys if key in groups)]
+            if not named:
+                raise CityError(f"{reader.path.name}: an instance names no shapegroup; correct it")
+            yield from _placed(reader, named[0], own, None)
+        elif kind == "merge":
+            yield from _placed(reader, shape, own, groups)
+        elif kind != "shapegroup":
+            yield shape, own
+
+
 def _material(
     reader: _Reader, city: settings.City, bsdf: ET.Element, notes: list[str]
 ) -> MaterialUse:
@@ -252,16 +274,15 @@ def mitsuba_file(city: settings.City, path: Path) -> tuple[list[Surface], list[s
         return MaterialUse(city.material) if key is None else known(key)
 
     def surfaces() -> Iterator[Surface]:
-        for shape in reader.root.iter("shape"):
+        groups = {str(g.get("id")): g for g in reader.root.findall("shape[@type='shapegroup']")}
+        for shape, transform in _placed(reader, reader.root, np.eye(4), groups):
             kind = shape.get("type", "")
-            if kind == "merge":
-                continue  # its members come along by themselves
             if kind not in _SHAPES and f".{kind}" not in _MESHES:
                 raise CityError(
                     f"{path.name}: shape {shape.get('id')!r} is of type {kind!r}; "
                     f"{', '.join(_SHAPES)} and meshes ({', '.join(_MESHES)}) are read here"
                 )
-            transform, material = transform_of(reader, shape), use(shape)
+            material = use(shape)
             for piece in _SHAPES.get(kind) or read(_mesh_path(reader, shape)):
                 vertices = piece.vertices @ transform[:3, :3].T + transform[:3, 3]
                 yield Surface(vertices, piece.faces, material)
