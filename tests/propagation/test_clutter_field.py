@@ -710,36 +710,6 @@ def test_speckle_of_the_field_is_rayleigh_where_few_share_a_cell():
     assert stats.kstest(samples, stats.expon.cdf).pvalue > 1e-4
 
 
-def test_what_a_triangle_hides_from_all_places_each_ray_meets():
-    """Points on random facets behind large and small triangles, and 14 places of a flight, by
-    barycentric coordinates: where a point is said to be hidden every ray meets the triangle, and
-    those that it meets well inside are said to be. Planted bugs: a side through another corner;
-    places but one; the share of the way from the other end."""
-    from isac_rt.propagation.legs import rays
-
-    rng = np.random.default_rng(8)
-    points, normals = rng.normal(0, 3, (2, 900, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    places = np.array([0.0, 50.0, 10.0]) + np.linspace(0, 1, 14)[:, None] * [9.0, 4.0, 2.0]
-    places += rng.normal(0, 0.2, places.shape)
-    triangles = object.__new__(rays.Triangles)
-    size = rng.choice([3.0, 30.0], 900)[:, None, None]
-    middle = points + rng.uniform(-0.1, 1.1, (900, 1)) * (places[6] - points)
-    corners = (middle[:, None] + size * rng.normal(0, 1, (900, 3, 3))).astype(np.float32)
-    triangles.corners = corners
-    hidden, box = np.zeros(900, bool), rays._box(places)
-    rays._hides(triangles.sides, np.arange(900), box, places, points, hidden)
-    a, b, c = np.moveaxis(corners.astype(float), 1, 0)[:, :, None]
-    side = np.sign(((places - points[:, None]) * normals[:, None]).sum(2, keepdims=True))
-    start = points[:, None] + side * rays.LIFT * normals[:, None]
-    matrix = np.stack(np.broadcast_arrays(b - a, c - a, start - places), axis=3)
-    u, v, way = np.moveaxis(np.linalg.solve(matrix, (start - a)[..., None])[..., 0], 2, 0)
-    inside = np.minimum.reduce([u, v, 1 - u - v])
-    assert (inside[hidden] > 0).all() and ((way > 0) & (way < 1))[hidden].all()
-    well = (inside > 0.05).all(1) & ((way > 0.1) & (way < 0.9)).all(1)
-    assert hidden[well].mean() > 0.97 and 50 < hidden.sum() < 500
-
-
 def test_points_ever_seen_are_those_seen_from_any_place():
     """In one kernel as place by place, points beyond corners and on roofs among them. Planted bugs:
     the last place is not looked from; a point once in the dark stays there."""

@@ -23,10 +23,9 @@ import numpy as np
 from isac_rt.kernels import propagation_mirrors
 from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.propagation_mirrors import APART
-from isac_rt.kernels.propagation_rays import LIFT
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.clutter.sight import Flight
-from isac_rt.propagation.legs.geometry import plane_of_each_face
+from isac_rt.propagation.legs.geometry import LIFT, plane_of_each_face
 from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.legs.reflection import slab_coefficients
 from isac_rt.world.city.materials import Material

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from isac_rt.kernels.propagation_rays import LIFT
 from isac_rt.propagation.clutter.cells import Cells
+from isac_rt.propagation.legs.geometry import LIFT
 from isac_rt.world.city.mesh import CityMesh
 
 PARALLEL = 0.999

@@ -25,8 +25,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from isac_rt.kernels.propagation_rays import LIFT
 from isac_rt.propagation.legs.diffraction import knife_edge
+from isac_rt.propagation.legs.geometry import LIFT
 from isac_rt.propagation.legs.rays import Triangles, computed, rays
 
 HALVINGS = 6

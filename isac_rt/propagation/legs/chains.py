@@ -21,8 +21,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from isac_rt.kernels.propagation_rays import LIFT
 from isac_rt.propagation.clutter.sight import Flight
+from isac_rt.propagation.legs.geometry import LIFT
 from isac_rt.propagation.legs.rays import rays
 from isac_rt.storage import checksum, kept, pack
 from isac_rt.world.city.mesh import CityMesh

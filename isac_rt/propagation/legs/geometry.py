@@ -14,6 +14,10 @@ import numpy as np
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
+LIFT = 2e-3
+"""Rays start this far from the surface and end as far before the viewer [m]; float32 corners and
+rays are good to a tenth of it."""
+
 
 @dataclass(frozen=True)
 class Legs:

@@ -25,9 +25,9 @@ import numpy as np
 
 from isac_rt.frame.link import Link
 from isac_rt.kernels.propagation_images import WIDER, reflected
-from isac_rt.kernels.propagation_rays import LIFT
 from isac_rt.propagation.legs.chains import Chains
 from isac_rt.propagation.legs.geometry import (
+    LIFT,
     Legs,
     edges_in_any_order,
     one_of_each_chain,

@@ -12,8 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from isac_rt.kernels.propagation_rays import LIFT
-from isac_rt.kernels.propagation_rays import hides as _hides
+from isac_rt.propagation.legs.geometry import LIFT
 
 CHUNK = 1 << 20
 
@@ -56,21 +55,6 @@ class Triangles:
         self._first = np.zeros(max(first) + 1, np.int64)
         self._first[list(first)] = list(first.values())
 
-    @cached_property
-    def sides(self) -> np.ndarray:
-        """(T, 4, 4): the planes of the triangles, then the planes across them through their sides,
-        as a unit vector, inward for sides, and how far along it they lie."""
-        corners = self.corners.astype(np.float64)
-        span = np.roll(corners, -1, axis=1) - corners
-        normal = np.cross(span[:, 0], span[:, 1])
-        with np.errstate(divide="ignore", invalid="ignore"):  # what is not a number hides nothing
-            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-            inward = np.cross(normal[:, None], span)
-            inward /= np.linalg.norm(inward, axis=2, keepdims=True)
-        vectors = np.concatenate([normal[:, None], inward], axis=1)
-        along = (vectors * np.concatenate([corners[:, :1], corners], axis=1)).sum(2, keepdims=True)
-        return np.concatenate([vectors, along], axis=2)
-
     def rows(self, hit: mi.PreliminaryIntersection3f) -> np.ndarray:
         """(K,) int64 into `corners`, -1 where nothing was hit."""
         shape = np.asarray(dr.reinterpret_array(mi.UInt32, hit.shape))
@@ -107,37 +91,22 @@ class Shadows:
 
     def ever_sees(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """(N,) whether any of `places` (K, 3) `sees` points: each is tested until one does, in one
-        kernel; but for those that a single triangle surely hides from all."""
+        kernel."""
         count = dr.opaque(mi.UInt32, len(places))  # else each number of places compiles anew
         view, out = _columns(places), np.zeros(len(points), bool)
-        left = np.flatnonzero(~self._hidden(places, points, normals))
-        for first in range(0, left.size, CHUNK):
-            part = left[first : first + CHUNK]
+        for first in range(0, len(points), CHUNK):
+            part = slice(first, first + CHUNK)
             facet = _columns(points[part], normals[part])
 
             def blocked(number: mi.UInt32, facet: list[mi.Float64] = facet) -> mi.Bool:
                 return self._blocked([dr.gather(mi.Float64, axis, number) for axis in view], facet)
 
             dark, _ = dr.while_loop(
-                (dr.full(mi.Bool, True, part.size), mi.UInt32(0)),
+                (dr.full(mi.Bool, True, len(points[part])), mi.UInt32(0)),
                 lambda dark, number: dark & (number < count),
                 lambda dark, number: (blocked(number), number + 1),
             )
             out[part] = ~computed(dark)
-        return out
-
-    def _hidden(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(N,) of which points the triangle that hides them from the middle one of `places` surely
-        hides them from all."""
-        out = np.zeros(len(points), bool)
-        for first in range(0, len(points) if len(places) > 1 else 0, CHUNK):
-            part = slice(first, first + CHUNK)
-            view = np.broadcast_to(places[len(places) // 2], points[part].shape)
-            ray = _ray(_columns(view), _columns(points[part], normals[part]))
-            hit = self.scene.ray_intersect_preliminary(ray)
-            dr.eval(hit)
-            row = self.triangles.rows(hit)
-            _hides(self.triangles.sides, row, _box(places), places, points[part], out[part])
         return out
 
     def all_seen(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -184,9 +153,3 @@ def _ray(place: list[mi.Float64], facet: list[mi.Float64]) -> mi.Ray3f:
     reach = mi.Float(dr.maximum(length - LIFT, 0.0))
     ray.maxt = reach  # type: ignore[assignment]  # stub: scalars
     return ray
-
-
-def _box(places: np.ndarray) -> np.ndarray:
-    """(8, 3) corners of the box about places (K, 3)."""
-    ends = np.stack([places.min(axis=0), places.max(axis=0)])
-    return np.stack(np.meshgrid(*ends.T), axis=-1).reshape(-1, 3)

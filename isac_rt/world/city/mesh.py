@@ -174,7 +174,7 @@ class CityMesh:
         if radius >= self.reach or not self.num_faces:
             return self
         corner = np.linalg.norm(self.corners, axis=2)
-        if (corner <= radius).all():
+        if self.reach <= radius or (corner <= radius).all():
             return self
         near = corner.min(axis=1) <= radius
         if not near.all():  # few have an edge or a middle nearer than their corners
