@@ -10,6 +10,7 @@ from isac_rt.frame.payload import Payload
 from isac_rt.frame.schedule import codes_of
 from isac_rt.receive.chain import Refiner, detector_of, filter_of, refiner_of
 from isac_rt.receive.clutter.filter import ClutterFilter
+from isac_rt.receive.joint.leakage import without_leakage
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Detector, look_at, make_maps
@@ -52,7 +53,12 @@ class ActiveReceiver:
         found = self.detector.sense(spectra, known, hints)
         detections = found.detections
         if self.refiner is not None:
-            detections = self.refiner(Moments(cube.samples, known), detections)[0]
+            moments = Moments(cube.samples, known)
+            least = self.settings.min_range_m
+            alone = without_leakage(cube.samples, known, moments.noise, least)
+            if alone is not cube.samples:
+                moments = Moments(alone, known)
+            detections = self.refiner(moments, detections)[0]
         picture = make_maps(found.power, cube, self.settings, 2) if maps else None
         out = Reception.undecoded(
             cube.waveform, detections, picture, found.sparse, found.correction

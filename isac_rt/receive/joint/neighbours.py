@@ -9,7 +9,7 @@ with those close to it; the others stay as they are.
 
 from __future__ import annotations
 
-from collections.abc import Set
+from collections.abc import Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -41,9 +41,11 @@ DIRECTIONS, DOPPLER_OFFSETS = 31, np.arange(-2.0, 2.01, 0.5)
 FARTHEST = np.array([1.5, 3.0])
 """Cells and bins that a path may move in the fit away from where it was found."""
 MISFIT, MISFIT_OFFSETS = 2.5, np.array([-0.5, 0.0, 0.5])
-"""Power of a channel over the noise, where a path was taken out or so many bins beside it, from
-which on the fit does not explain the samples; of 12 channels and more noise shows it once in ten
-thousand."""
+"""Power of a channel over what is left about a path, where the path was taken out or so many bins
+beside it, from which on the fit does not explain the samples; of 12 channels and more noise shows
+it once in ten thousand."""
+DISTANCES = np.array([-6.0, -5.0, -4.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+"""Cells or Doppler bins off a path where what is left is measured."""
 PROBED_CELLS = (-1.5, -0.75, 0.75, 1.5)
 """Where a neighbour in the main lobe of Hann's window is sought besides, off the path in delay."""
 LINE_OF_SIGHT_DB = 10.0
@@ -72,14 +74,26 @@ def refine_jointly(moments: Moments, detections: Detections) -> tuple[Detections
 
 
 def _widened(moments: Moments, found: Fit) -> list[JointPath]:
-    """The paths of a fit, with deviations as much larger as the channels hold more than noise where
-    a path was taken out: what no path explains may have moved it so far."""
-    noise, out = found.left / moments.size, []
-    left = residual_channels(moments, found, found.paths, MISFIT_OFFSETS)
-    for path, (channels, _) in zip(found.paths, left, strict=True):
-        most = float((np.abs(channels) ** 2).mean(axis=(1, 2)).max()) / noise
-        out.append(replace(path, std=path.std * np.sqrt(most)) if most > MISFIT else path)
-    return out
+    """The paths of a fit, with deviations by the power that is left about each: noise, and echoes
+    that nothing found. They grow with the root of what the channels hold over it where the path
+    was taken out: what no path explains may have moved it so far."""
+    known, paths, noise = moments.known, found.paths, found.left / moments.size
+
+    def left(beside: Sequence[JointPath], offsets: np.ndarray) -> np.ndarray:
+        around = residual_channels(moments, found, beside, offsets)
+        power = np.array([(np.abs(c) ** 2).mean(axis=(1, 2)) for c, _ in around])
+        return power.reshape(len(paths), -1) / noise
+
+    bins = left(paths, np.concatenate([DISTANCES, MISFIT_OFFSETS]))
+    beside = [_probe(known, p, float(c)) for p in paths for c in DISTANCES]
+    cells, at = left(beside, np.zeros(1)), bins[:, DISTANCES.size :].max(axis=1)
+    near = np.abs(DISTANCES) == 1
+    # a tangent of delay or of rate holds as much of a tone k cells or bins off as 1/k^2
+    share = DISTANCES**-2.0 / (DISTANCES**-2.0).sum()
+    about = np.hstack([cells[:, near], bins[:, : DISTANCES.size][:, near]]).mean(axis=1)
+    level = np.stack([cells @ share, bins[:, : DISTANCES.size] @ share, about, about], axis=1)
+    level[at > MISFIT * about] *= (at / about)[at > MISFIT * about, None]
+    return [replace(p, std=p.std * s) for p, s in zip(paths, np.sqrt(level), strict=True)]
 
 
 def _with_hidden(
@@ -174,7 +188,9 @@ def separate(moments: Moments, reference: Detections) -> tuple[Detections, np.nd
     trial = fit(moments, [*one.paths, found[2]], iterations=MOST_STEPS)
     if trial.left > one.left or not _credible(known, trial.paths, [*one.paths, found[2]], 0):
         return None
-    return _merged(known, reference, np.zeros(1, int), trial.paths, [0], np.ones(2, bool))
+    return _merged(
+        known, reference, np.zeros(1, int), _widened(moments, trial), [0], np.ones(2, bool)
+    )
 
 
 def _path(known: Known, d: Detections, i: int) -> JointPath:
