@@ -233,7 +233,7 @@ MAX_LINES = {
     "hardware": 1300,
     "propagation": 5000,
     "signal": 1500,
-    "receive": 7850,
+    "receive": 8050,
     "track": 4900,
     "access": 1850,
     "scenario": 1550,
