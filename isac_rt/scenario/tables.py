@@ -9,14 +9,40 @@ import io
 import math
 import stat
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from isac_rt.settings import Key
+from isac_rt.world.settings import City
+
+if TYPE_CHECKING:
+    from isac_rt.world.city.place import Place
 
 MAX_BYTES = 4_000_000
 MAX_ROWS = 20_000
 MAX_WAYPOINTS = 5_000
+_DEGREES = ("lat", "lon", "alt")
+_NAMES = {
+    f"{name}{unit}": short
+    for short, names in {
+        "lat": ("lat", "latitude"),
+        "lon": ("lon", "lng", "long", "longitude"),
+        "alt": ("alt", "altitude", "height"),
+        "x": ("x", "easting"),
+        "y": ("y", "northing"),
+        "z": ("z",),
+    }.items()
+    for name in names
+    for unit in ("", "_deg", "_m")
+}
+"""What logs of flights call their columns."""
+_GRID_M = 5e4
+"""Places farther from the world's origin are in a grid such as UTM [m]."""
 
 
 class TableError(ValueError):
@@ -28,7 +54,10 @@ class TableError(ValueError):
 
 
 def read_csv(
-    path: Path, needed: tuple[str, ...], optional: tuple[str, ...] = ()
+    path: Path,
+    needed: tuple[str, ...],
+    optional: tuple[str, ...] = (),
+    otherwise: tuple[str, ...] = (),
 ) -> dict[str, list[float]]:
     r"""Columns of a CSV file with a header: finite numbers, by comma or semicolon.
 
@@ -37,6 +66,7 @@ def read_csv(
     path : of a regular file of at most 4 MB and 20,000 rows; lines that begin with # are passed
         over
     needed, optional : names of the columns, in any order
+    otherwise : columns that may stand in place of those `needed`
 
     Raises
     ------
@@ -58,9 +88,13 @@ def read_csv(
         raise ValueError("is empty; a table needs a header and rows")
     mark = ";" if ";" in lines[0][1] else ","
     header = [name.strip().lower() for name in _split(lines[0], mark)]
+    header = [_NAMES.get(name, name) for name in header]
+    if otherwise and set(otherwise) <= set(header):
+        needed = otherwise
     known = {*needed, *optional}
     if missing := [name for name in needed if name not in header]:
         wanted = ", ".join((*needed, *(f"[{name}]" for name in optional)))
+        wanted += f" or {', '.join(otherwise)}" if otherwise else ""
         raise ValueError(
             f"line {lines[0][0]}: no column {missing[0]}; its header must be {wanted}, not "
             f"{', '.join(header)[:80]!r}"
@@ -123,24 +157,66 @@ def _places(path: Path) -> dict[str, Any]:
     return {"positions": [list(row) for row in rows]}
 
 
-def _flight(path: Path) -> dict[str, Any]:
-    turned = ("yaw_deg", "pitch_deg", "roll_deg")
-    c = read_csv(path, ("time_s", "x", "y", "z"), turned)
+def _flight(city: Any, folder: Path, path: Path) -> dict[str, Any]:
+    """Waypoints of a flight in world coordinates, or in those of the city's file: longitude and
+    latitude, or a grid's metres from far beyond the world's origin."""
+    turned, xyz, degrees = ("yaw_deg", "pitch_deg", "roll_deg"), ("x", "y", "z"), _DEGREES
+    c = read_csv(path, ("time_s", *xyz), turned, ("time_s", *degrees))
     if len(c["time_s"]) > MAX_WAYPOINTS:
         raise ValueError(
             f"has {len(c['time_s'])} rows, a flight has at most {MAX_WAYPOINTS}; thin it out"
         )
     some = [name for name in turned if name in c]
-    if some and len(some) < len(turned):
-        raise ValueError(f"has {' and '.join(some)} alone of {', '.join(turned)}; add the others")
-    places = zip(c["x"], c["y"], c["z"], strict=True)
+    if some and turned[0] not in some:
+        raise ValueError(f"has {' and '.join(some)} without {turned[0]}; add it")
+    places = np.column_stack([c[name] for name in (xyz if "x" in c else degrees)])
+    if "x" not in c:
+        places = _from_degrees(places, _place(city, folder))
+    elif np.abs(np.median(places[:, :2], axis=0)).max() > _GRID_M:
+        places = _from_grid(places, _place(city, folder), city)
     out: list[dict[str, Any]] = [
-        {"time_s": time, "position_m": list(place)}
-        for time, place in zip(c["time_s"], places, strict=True)
+        {"time_s": time, "position_m": place}
+        for time, place in zip(c["time_s"], places.tolist(), strict=True)
     ]
-    for point, angles in zip(out, zip(*(c[name] for name in some), strict=True), strict=False):
-        point["attitude_deg"] = list(angles)
+    for i, point in enumerate(out if some else ()):
+        point["attitude_deg"] = [c[name][i] if name in c else 0.0 for name in turned]
     return {"waypoints": out}
+
+
+def _place(city: Any, folder: Path) -> Place | None:
+    """Return where a scenario's city lies, by its tree."""
+    from isac_rt.world.city.sources import city_place
+
+    try:
+        settings = None if city is None else City.model_validate(city)
+    except ValidationError:  # told by whoever checks the scenario
+        return None
+    return None if settings is None else city_place(settings, folder)
+
+
+def _from_degrees(places: NDArray[np.float64], place: Place | None) -> NDArray[np.float64]:
+    """Latitude, longitude [degrees] and height [m] to world coordinates."""
+    if place is None or not place.crs:
+        raise ValueError(
+            "has latitude and longitude, and no map says where on Earth the world's origin lies; "
+            "state x, y, z [m] from the origin, or city.crs with footprints"
+        )
+    if np.abs(places[:, 0]).max() > 90:
+        raise ValueError("has a latitude beyond 90 degrees; exchange lat and lon")
+    return place.from_degrees(places[:, [1, 0, 2]])
+
+
+def _from_grid(places: NDArray[np.float64], place: Place | None, city: Any) -> NDArray[np.float64]:
+    """Metres of the grid of a city's file, such as UTM, to world coordinates; a city without an
+    origin of its own lies in that grid too."""
+    source = city.get("source") if isinstance(city, dict) else None
+    if (place is not None and place.plane) or source in ("builtin", "canyon", "blocks"):
+        where = "" if place is None else f", {place.words().removeprefix('world origin ')}"
+        raise ValueError(
+            f"lies {np.abs(places[0, :2]).max():.0f} m from the world's origin{where}, as in UTM; "
+            "state x, y, z [m] from the origin, or lat, lon, alt over a map"
+        )
+    return places if place is None else place.to_world(places)
 
 
 def _by_aspect(unit: str) -> Reader:
@@ -168,14 +244,14 @@ def _pattern(path: Path) -> dict[str, Any]:
     return {"pattern": _by_aspect("dbi")(path)["table"]}
 
 
-def _tables_of(tree: dict[str, Any]) -> Iterator[tuple[Key, str, Reader]]:
+def _tables_of(tree: dict[str, Any], folder: Path) -> Iterator[tuple[Key, str, Reader]]:
     """Mappings of a tree that may name a table, the key that does, and how it is read."""
     yield ("array", "tx"), "file", _places
     yield ("array", "rx"), "file", _places
     yield ("array",), "pattern_file", _pattern
     swarm = tree.get("swarm")
     for name in swarm if isinstance(swarm, dict) else ():
-        yield ("swarm", name), "flight", _flight
+        yield ("swarm", name), "flight", partial(_flight, tree.get("city"), folder)
         yield ("swarm", name, "rcs"), "file", _by_aspect("dbsm")
 
 
@@ -190,7 +266,7 @@ def with_tables(tree: dict[str, Any], folder: Path, *, replace: bool = False) ->
     TableError  If a file is none, is not readable as a table, or numbers are stated beside it.
     """
     out = tree
-    for key, name, reader in _tables_of(tree):
+    for key, name, reader in _tables_of(tree, folder):
         here = _at(out, key)
         file = here.get(name) if isinstance(here, dict) else None
         if not isinstance(file, str):

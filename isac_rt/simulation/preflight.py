@@ -81,6 +81,7 @@ def check_flights(swarm: Swarm, timetable: Timetable) -> None:
     ------
     ScenarioError
     """
+    _check_times(swarm, timetable)
     step = max(1, timetable.frames // MOST_EPOCHS)
     epochs = np.array([timetable.epoch(frame) for frame in range(0, timetable.frames, step)])
     with np.errstate(over="ignore", invalid="ignore"):
@@ -103,6 +104,23 @@ def check_flights(swarm: Swarm, timetable: Timetable) -> None:
                 f"{nearest * step}), at least "
                 f"{NEAREST_M} m are needed; change one of their flights"
             )
+
+
+def _check_times(swarm: Swarm, timetable: Timetable) -> None:
+    """Refuse waypoints of another time than the run's, and warn of those of a part of it."""
+    begin, end = timetable.epoch(0), timetable.epoch(timetable.frames - 1)
+    for name, uav in swarm.uavs.items():
+        if uav.waypoints is None:
+            continue
+        first, last = uav.waypoints[0].time_s, uav.waypoints[-1].time_s
+        said = (
+            f"swarm.{name}: its waypoints are from {first:g} to {last:g} s, the run is from "
+            f"{begin:.3g} to {end:.3g} s"
+        )
+        if first > end or last < begin:
+            raise ScenarioError(f"{said}; count time_s from the start of the run")
+        if max(first - begin, end - last) > timetable.interval:
+            _warn(f"{said}; it flies straight on before and after them")
 
 
 def check_passage(swarm: Swarm, timetable: Timetable, city: CityMesh) -> None:

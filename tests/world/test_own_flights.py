@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
+import json
+import warnings
 
-from isac_rt.document import ScenarioError
+import numpy as np
+import pyproj
+import pytest
+import trimesh
+
+from isac_rt.document import ScenarioError, ScenarioWarning
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.rcs import CrossSection
 from isac_rt.scenario.file import load, to_yaml
 from isac_rt.settings import AspectTable
+from isac_rt.simulation.setup import prepare
 from isac_rt.sweep import load_sweep
 from isac_rt.world.aspect import in_table
 from isac_rt.world.swarm import Trajectory, turned
@@ -159,7 +165,7 @@ def test_what_cannot_be_flown_is_one_message(tmp_path, overrides, said):
 @pytest.mark.parametrize(
     ("header", "rows", "said"),
     [
-        ("time_s,x,y,z,yaw_deg", [(0, 0, 0, 9, 1)], "add the others"),
+        ("time_s,x,y,z,roll_deg", [(0, 0, 0, 9, 1)], "without yaw_deg"),
         ("time_s,x,y,z", [(0, 0, 0, 9), (0, 1, 0, 9)], "must be later"),
         ("time_s,x,y,z", [(i, i, 0, 9) for i in range(5001)], "at most 5000; thin it out"),
     ],
@@ -210,3 +216,130 @@ def test_a_table_of_azimuths_from_0_to_350_goes_round():
     angles = np.radians([-20.0, 110.0, -170.0])
     ways = np.stack([np.sin(angles), np.cos(angles), 0 * angles], axis=1)
     assert in_table(table, ways) == pytest.approx([1, 2, 2])
+
+
+# ---- in the coordinates of a map
+
+
+def quarter(folder, origin=(11.0, 48.0), crs=None, scale=(1 / 74_600, 1 / 111_200)):
+    """GeoJSON of two houses about an origin, in degrees or in a grid."""
+    corners = np.array([[0, 0], [20, 0], [20, 22], [0, 22], [0, 0]], float)
+    rings = [corners + at for at in ((-60, 0), (60, 0))]
+    shapes = [
+        {"type": "Polygon", "coordinates": [(np.array(origin) + ring * scale).tolist()]}
+        for ring in rings
+    ]
+    tree = {
+        "type": "FeatureCollection",
+        "features": [
+            {"type": "Feature", "properties": {"height": 9}, "geometry": shape} for shape in shapes
+        ],
+    }
+    if crs:
+        tree["crs"] = {"type": "name", "properties": {"name": crs}}
+    (folder / "town.geojson").write_text(json.dumps(tree))
+
+
+def over_a_map(folder, header, rows, city="source: footprints, file: town.geojson"):
+    lines = [header, *(",".join(map(repr, map(float, row))) for row in rows)]
+    (folder / "flight.csv").write_text("\n".join(lines) + "\n")
+    scene = SCENE.replace("position_m: [1, 20, 12], velocity_mps: [3, 4, 0]", "flight: flight.csv")
+    return scenario(folder, scene=f"city: {{{city}}}\n{scene}" if city else scene)
+
+
+WGS84 = pyproj.Geod(ellps="WGS84")
+
+
+@pytest.mark.parametrize("header", ["time_s,lat,lon,alt", "time_s,Latitude,longitude_deg,altitude"])
+@pytest.mark.parametrize("grid", [None, "EPSG:25832"])
+def test_latitude_and_longitude_are_read_with_the_city(tmp_path, header, grid):
+    """Distance and bearing from the origin by the geodesic. Planted bug: latitude taken as x."""
+    if grid:
+        to_grid = pyproj.Transformer.from_crs("EPSG:4326", grid, always_xy=True)
+        origin = to_grid.transform(11.0, 48.0)
+        quarter(tmp_path, origin, grid, (1, 1))
+    else:
+        origin = (11.0, 48.0)
+        quarter(tmp_path)
+    city = f"source: footprints, file: town.geojson, origin: [{origin[0]}, {origin[1]}, 3]"
+    rows = [(0, 48.00031, 11.00042, 18), (1, 48.00013, 10.99957, 19)]
+    way = over_a_map(tmp_path, header, rows, city).swarm["T"].waypoints
+    for row, point in zip(rows, way, strict=True):
+        azimuth, _, distance = WGS84.inv(11, 48, row[2], row[1])
+        x, y, z = point.position_m
+        assert np.hypot(x, y) == pytest.approx(distance, rel=1e-3)  # the grid's scale
+        turned = np.degrees(np.arctan2(x, y)) - azimuth
+        assert (turned + 180) % 360 - 180 == pytest.approx(0, abs=0.01 if not grid else 2)
+        assert z == row[3] - 3
+
+
+def test_a_flight_in_utm_is_read_with_the_citys_origin(tmp_path):
+    """Of a mesh and of footprints in a grid; a city that has no origin lies in the grid itself.
+    Planted bug: the height not taken from the origin's."""
+    rows = [(0, 691_010.0, 5_334_020.0, 535.0), (1, 691_011.5, 5_334_021.0, 535.5)]
+    trimesh.creation.box((9, 9, 9)).export(tmp_path / "box.obj")
+    origin = "origin: [691000, 5334000, 520]"
+    quarter(tmp_path, (691_000, 5_334_000), "EPSG:25832", (1, 1))
+    for source in ("source: mesh, file: box.obj", "source: footprints, file: town.geojson"):
+        way = over_a_map(tmp_path, "time_s,x,y,z", rows, f"{source}, {origin}").swarm["T"].waypoints
+        assert [w.position_m for w in way] == [(10, 20, 15), (11.5, 21, 15.5)]
+        way = over_a_map(tmp_path, "time_s,x,y,z", rows, source).swarm["T"].waypoints
+        assert way[0].position_m == rows[0][1:]
+        near = [(0, 10.0, 20.0, 15.0), (1, 11.5, 21.0, 15.5)]
+        way = over_a_map(tmp_path, "time_s,x,y,z", near, f"{source}, {origin}").swarm["T"].waypoints
+        assert way[0].position_m == near[0][1:]
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "city", "said"),
+    [
+        ("time_s,lat,lon,alt", (48, 11, 9), "", "state x, y, z"),
+        ("time_s,lat,lon,alt", (48, 11, 9), "source: canyon", "state x, y, z"),
+        ("time_s,lat,lon,alt", (98, 11, 9), "source: footprints, file: town.geojson", "exchange"),
+        (
+            "time_s,x,y,z",
+            (691_000, 5_334_000, 535),
+            "source: footprints, file: town.geojson",
+            "lat, lon, alt over a map",
+        ),
+        (
+            "time_s,x,y,z",
+            (691_000, 5_334_000, 535),
+            "source: blocks",
+            "from the world's origin, as in UTM",
+        ),
+        ("time_s,lat,lon", (48, 11), "", "or time_s, lat, lon, alt"),
+    ],
+)
+def test_a_flight_that_no_map_places_says_what_to_state(tmp_path, header, row, city, said):
+    """In one message with the key."""
+    quarter(tmp_path)
+    with pytest.raises(ScenarioError, match=said) as refused:
+        over_a_map(tmp_path, header, [(0, *row), (1, *row)], city)
+    assert "swarm.T.flight" in str(refused.value)
+
+
+def test_yaw_alone_flies_level(tmp_path):
+    """Pitch and roll are 0; without the yaw, they say nothing."""
+    s = flight(tmp_path, [(0, 0, 0, 9, 10), (1, 1, 0, 9, 20)], "time_s,x,y,z,yaw_deg")
+    assert [w.attitude_deg for w in s.swarm["T"].waypoints] == [(10, 0, 0), (20, 0, 0)]
+    s = flight(tmp_path, [(0, 0, 0, 9, 1, 2), (1, 1, 0, 9, 3, 4)], "time_s,x,y,z,roll_deg,yaw_deg")
+    assert s.swarm["T"].waypoints[1].attitude_deg == (4, 0, 3)
+
+
+def test_waypoints_of_another_time_than_the_run_are_refused(tmp_path):
+    """They were prolonged in silence. Those of a part of the run are warned of, all others not.
+    Planted bug: the run's end taken for the flight's."""
+    run = {"frames": 5, "frame_interval_s": 0.25}
+    for begin, end in ((5.0, 25.0), (-9.0, -1.0)):
+        s = flight(tmp_path, [(begin, 0, 30, 9), (end, 1, 30, 9)]).model_copy(update=run)
+        with pytest.raises(ScenarioError, match=f"swarm.T: .* from {begin:g} to {end:g} s"):
+            prepare(s)
+    for begin, end in ((0.6, 9.0), (-9.0, 0.6)):
+        s = flight(tmp_path, [(begin, 0, 30, 9), (end, 1, 30, 9)]).model_copy(update=run)
+        with pytest.warns(ScenarioWarning, match="swarm.T: .* straight on"):
+            prepare(s)
+    s = flight(tmp_path, [(0, 0, 30, 9), (1.1, 1, 30, 9)]).model_copy(update=run)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="swarm.T")
+        prepare(s)

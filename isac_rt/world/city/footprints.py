@@ -214,6 +214,23 @@ def _raised(
     return surfaces
 
 
+def located(
+    city: settings.City, path: Path, notes: list[str], bad: list[str]
+) -> tuple[CityModel, Place]:
+    """Return what a map's file holds, in its own coordinates, and where it lies.
+
+    Raises
+    ------
+    CityError
+    """
+    model = _without_strays(_model(city, path, notes), bad)
+    if not model.outlines and not model.bodies:
+        raise CityError(
+            bad[0] if bad else f"{path.name}: there is no polygon in it; give building footprints"
+        )
+    return model, _place(city, model, path.name, notes)
+
+
 def footprints(
     city: settings.City, path: Path, terrain: Path | None = None
 ) -> tuple[list[Surface], list[str], Place]:
@@ -234,12 +251,7 @@ def footprints(
     CityError
     """
     notes, bad = list[str](), list[str]()
-    model = _without_strays(_model(city, path, notes), bad)
-    if not model.outlines and not model.bodies:
-        raise CityError(
-            bad[0] if bad else f"{path.name}: there is no polygon in it; give building footprints"
-        )
-    place = _place(city, model, path.name, notes)
+    model, place = located(city, path, notes, bad)
     model = _moved(model, place)
     base = _ground(city, model, terrain, place, notes)
     if place.crs or any(place.origin):

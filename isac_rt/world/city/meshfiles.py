@@ -39,6 +39,8 @@ _NAMED = 20
 """Most names that a message lists."""
 _SOLID = re.compile(r"^[ \t]*solid\b", re.MULTILINE | re.IGNORECASE)
 _VERTEX = re.compile(r"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+_Y_UP = (".glb", ".gltf")
+"""Formats whose standard has y up."""
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
@@ -305,7 +307,7 @@ def pieces(path: Path, formats: tuple[str, ...] = tuple(_READERS)) -> Iterator[P
 
 def mesh_files(path: Path) -> list[Path]:
     """A mesh file and those that it is read from."""
-    if path.suffix.lower() not in (".glb", ".gltf"):
+    if path.suffix.lower() not in _Y_UP:
         return [path]
     with _readable(path):
         named = [_buffer_file(path, buffer) for buffer in _gltf(path)[0].get("buffers", [])]
@@ -338,6 +340,16 @@ def _listed(names: Counter[str], unit: str) -> str:
     return f"{', '.join(listed)}{rest}; city.material_map says what they are"
 
 
+def _is_y_up(city: settings.City, path: Path) -> bool:
+    return city.up_axis == "y" or (city.up_axis == "auto" and path.suffix.lower() in _Y_UP)
+
+
+def mesh_place(city: settings.City, path: Path) -> Place | None:
+    """Return the relation of a mesh file to the world; None where it is no plain shift."""
+    plain = city.origin is not None and city.scale == 1 and not _is_y_up(city, path)
+    return Place("", city.origin) if plain and city.origin else None
+
+
 def mesh_file(
     city: settings.City, path: Path
 ) -> tuple[list[Surface], list[str], Place | None, bool]:
@@ -348,8 +360,8 @@ def mesh_file(
     A piece's material is what `material_map` says of its node, geometry or material name, else a
     known material of that name, else `material`."""
     seen, notes, unknown, guessed = set[str](), list[str](), Counter[str](), Counter[str]()
-    gltf, origin = path.suffix.lower() in (".glb", ".gltf"), city.origin or (0.0, 0.0, 0.0)
-    y_up = city.up_axis == "y" or (city.up_axis == "auto" and gltf)
+    gltf, origin = path.suffix.lower() in _Y_UP, city.origin or (0.0, 0.0, 0.0)
+    y_up = _is_y_up(city, path)
 
     def surfaces() -> Iterator[Surface]:
         for piece in pieces(path):
@@ -382,5 +394,4 @@ def mesh_file(
         notes.append(f"{said}: {_listed(guessed, 'pieces')}")
     if gltf and not y_up:
         notes.append("glTF is y-up by its standard, and city.up_axis is z")
-    plain = city.origin is not None and city.scale == 1 and not y_up
-    return found, notes, Place("", origin) if plain else None, city.up_axis == "auto" and not gltf
+    return found, notes, mesh_place(city, path), city.up_axis == "auto" and not gltf

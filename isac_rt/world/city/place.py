@@ -97,6 +97,20 @@ class Place:
         out[:, 2:] += self.origin[2]
         return out
 
+    def from_degrees(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (N, 3) by longitude, latitude [degrees] and height [m] of the file to metres about
+        the origin, of a place whose `crs` is known."""
+        from pyproj import Transformer
+
+        out = np.array(points, dtype=np.float64)
+        if self.plane:
+            out[:, 0], out[:, 1] = self._plane(points[:, 0], points[:, 1])
+            out[:, 2] -= self.origin[2]
+            return out
+        grid = Transformer.from_crs(LONLAT, self.crs, always_xy=True)
+        out[:, 0], out[:, 1] = grid.transform(points[:, 0], points[:, 1])
+        return self.to_world(out)
+
     def words(self) -> str:
         """One sentence for people."""
         x, y, z = self.origin

@@ -16,7 +16,7 @@ from isac_rt.world import settings
 from isac_rt.world.city.files import needs_extra
 from isac_rt.world.city.materials import CityError, resolve_materials
 from isac_rt.world.city.mesh import CityMesh, Surface, check_size, clean, empty_city
-from isac_rt.world.city.meshfiles import mesh_file, mesh_files
+from isac_rt.world.city.meshfiles import mesh_file, mesh_files, mesh_place
 from isac_rt.world.city.mitsuba_xml import builtin_path, mitsuba_file, mitsuba_files
 from isac_rt.world.city.place import Place
 
@@ -136,6 +136,22 @@ def mitsuba(city: settings.City, folder: Path) -> CityParts:
 
 
 builtin = mitsuba
+
+
+def city_place(city: settings.City, folder: Path) -> Place | None:
+    """Where a city from a file lies, without building it; None where it does not say.
+
+    Raises
+    ------
+    CityError
+    """
+    if city.source == "mesh":
+        return mesh_place(city, _path(city, folder))
+    if city.source != "footprints":
+        return None
+    path = _path(city, folder)
+    place: Place = _map_reader("footprints", path).located(city, path, [], [])[1]
+    return place
 
 
 def load_city(
