@@ -111,6 +111,12 @@ def _say_status(folder: Path) -> None:
     say(*(f"  failed at {list(index)}: {error.splitlines()[0]}" for index, error in found.errors))
     if found.failed:
         say("  --retry-failed runs them again")
+    for count, cause in (
+        (found.other_version, "by another version of isac_rt or of its packages"),
+        (found.other_scenario, "for other values of the scenario or of its files"),
+    ):
+        if count:
+            say(f"  {count} more in the folder were computed {cause} and are not used")
 
 
 def dataset(

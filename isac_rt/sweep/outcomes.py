@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import fnmatch
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -97,8 +97,18 @@ class Outcomes:
         ------
         isac_rt.storage.StorageError  If it cannot be written.
         """
-        kept = {"key": key, **outcome, "checksum": _checksum(key, {"key": key, **outcome})}
+        content = {"key": key, **outcome, "made_by": _made_by()}
+        kept = content | {"checksum": _checksum(key, content)}
         write_whole(self.file(key), json.dumps(kept) + "\n")
+
+    def others(self, keys: Set[str]) -> tuple[int, int]:
+        """Count the points in the folder that are none of `keys`: those of another version of the
+        program or of its packages, and those of other values of the scenario."""
+        strangers = [f.stem for f in self.points.glob("*/*.json") if f.stem not in keys]
+        found = [outcome for key in strangers if (outcome := self.read(key)) is not None]
+        mine = _made_by()
+        same = sum(outcome.get("made_by") == mine for outcome in found)
+        return len(found) - same, same
 
     def done(self, key: str, retry_failed: bool) -> bool:
         """Return whether a point needs no run: it succeeded, or it failed and is not to be tried
@@ -143,13 +153,22 @@ class Outcomes:
 
 @dataclass(frozen=True)
 class Status:
-    """Progress of a sweep: counts of points, and the errors of those that failed (index along the
-    axes, message)."""
+    """Progress of a sweep.
+
+    Attributes
+    ----------
+    total, done, failed : points
+    errors : of those that failed (index along the axes, message)
+    other_version, other_scenario : points in the folder that another version of the program or of
+        its packages made, and those of other values of the scenario; neither is used
+    """
 
     total: int
     done: int
     failed: int
     errors: list[tuple[tuple[int, ...], str]]
+    other_version: int
+    other_scenario: int
 
 
 def status(folder: Path | str) -> Status:
@@ -158,7 +177,9 @@ def status(folder: Path | str) -> Status:
     plan = outcomes.definition()
     done, failed = 0, 0
     errors: list[tuple[tuple[int, ...], str]] = []
+    keys = set()
     for point in plan.points():
+        keys.add(point.key)
         outcome = outcomes.read(point.key)
         if outcome is None:
             continue
@@ -168,7 +189,7 @@ def status(folder: Path | str) -> Status:
             failed += 1
             if len(errors) < 20:
                 errors.append((point.index, outcome["error"]))
-    return Status(plan.sweep.num_points, done, failed, errors)
+    return Status(plan.sweep.num_points, done, failed, errors, *outcomes.others(keys))
 
 
 def _checksum(key: str, outcome: dict[str, Any]) -> str:

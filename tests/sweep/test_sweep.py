@@ -407,6 +407,30 @@ def test_an_unfinished_sweep_can_be_read_and_a_failed_point_does_not_stop_it(fol
     )
 
 
+def test_the_status_counts_points_of_other_versions_and_scenarios(folder, capsys, monkeypatch):
+    """Two points of an older program and one of another value lie beside one that is done. Planted
+    bugs: points of the sweep counted too; the versions not compared."""
+    plan = plan_of(
+        folder, "scenario: base.yaml\nname: x\naxes:\n  s: {key: noise.snr_db, values: [1, 2]}\n"
+    )
+    outcomes = Outcomes(folder / "out")
+    outcomes.save_definition(plan)
+    first, _ = plan.points()
+    for key in (first.key, "a1" * 16):
+        outcomes.write(key, {"status": "done"})
+    with monkeypatch.context() as older:
+        older.setattr("isac_rt.sweep.outcomes.program_fingerprint", lambda: "0.1+old")
+        for key in ("b2" * 16, "c3" * 16):
+            outcomes.write(key, {"status": "failed", "error": "no"})
+    found = status(outcomes.folder)
+    assert (found.total, found.done, found.failed) == (2, 1, 0)
+    assert (found.other_version, found.other_scenario) == (2, 1)
+    assert main(["sweep", "--status", str(outcomes.folder)]) == 0
+    said = capsys.readouterr().out
+    assert "2 more in the folder were computed by another version of isac_rt" in said
+    assert "1 more in the folder were computed for other values of the scenario" in said
+
+
 def test_status_of_no_sweep_is_refused(tmp_path, capsys):
     assert main(["sweep", "--status", str(tmp_path)]) == 2
     assert "holds no sweep" in capsys.readouterr().err
