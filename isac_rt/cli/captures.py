@@ -17,19 +17,22 @@ if TYPE_CHECKING:
 
 DescriptionFile = Annotated[
     Path | None,
-    typer.Option("--description", metavar="YAML", help="What the file does not say of itself."),
+    typer.Option(
+        "--description", metavar="YAML", help="Settings of the board that the file does not hold."
+    ),
 ]
 Format = Annotated[
     str | None,
     typer.Option(
         "--format",
         metavar="NAME",
-        help="ti_calibration, dca1000, numpy or sigmf; by default as the file's name ends.",
+        help="ti_calibration, dca1000, numpy or sigmf.",
+        show_default="by suffix",
     ),
 ]
 CalibrationFile = Annotated[
     Path | None,
-    typer.Option("--calibration", metavar="CAL", help="Of the board: what to take out."),
+    typer.Option("--calibration", metavar="CAL", help="Calibration of the board to apply."),
 ]
 KEYS = (
     "range_m range_scatter_mm rank_one_share left_db left_deg gain_spread_rx_db gain_spread_tx_db "
@@ -52,13 +55,13 @@ def with_standard_output(arguments: list[str]) -> list[str]:
 
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Samples of a radar board.")],
-    out: Annotated[Path, typer.Option(metavar="CUBE.nc", help="Where the cube goes.")],
+    out: Annotated[Path, typer.Option(metavar="CUBE.nc", help="Cube to write.")],
     description: DescriptionFile = None,
     format: Format = None,
     calibration: CalibrationFile = None,
 ) -> None:
-    """Make a cube of IF samples of a radar board's file: TI's calibration (.mat), a DCA1000's
-    (.bin), NumPy (.npy) or SigMF."""
+    """Convert the file of a radar board into a cube of IF samples. Reads TI's calibration (.mat),
+    DCA1000 (.bin), NumPy (.npy) and SigMF."""
     from isac_rt.capture.store import load_capture, save_capture
     from isac_rt.results.files import check_folder
 
@@ -77,23 +80,24 @@ def calibrate(
         Path | None,
         typer.Argument(metavar="CUBE", help="A cube, or a file that `import` reads by itself."),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="CAL", help="Where the calibration goes.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="CAL", help="Calibration to write.")] = None,
     json_file: Annotated[
         str | None,
-        typer.Option("--json", metavar="[FILE]", help="Figures as JSON; no file: printed."),
+        typer.Option(
+            "--json", metavar="[FILE]", help="Write the result as JSON; without FILE print it."
+        ),
     ] = None,
     description: DescriptionFile = None,
     azimuth_deg: Annotated[
-        float, typer.Option(min=-89, max=89, help="Of the reflector from the boresight.")
+        float,
+        typer.Option(min=-89, max=89, help="Azimuth of the reflector from boresight, in degrees."),
     ] = 0.0,
     elevation_deg: Annotated[
-        float, typer.Option(min=-89, max=89, help="Of the reflector from the horizontal.")
+        float, typer.Option(min=-89, max=89, help="Elevation of the reflector, in degrees.")
     ] = 0.0,
 ) -> None:
-    """Find a board's gains, phases, delays and response over the sweep from one strong
-    reflector."""
+    """Calibrate a board with one strong reflector. Estimates gains, phases, delays and the response
+    over the sweep."""
     from isac_rt.capture.calibrate import calibrate as fit
     from isac_rt.capture.calibrate import save_calibration
     from isac_rt.capture.explain import STEPS, unexplained_by
@@ -164,16 +168,18 @@ def receive(
     cube: Annotated[
         Path, typer.Argument(metavar="CUBE", help="A cube, or a file that `import` reads.")
     ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the results go.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the results.")],
     calibration: CalibrationFile = None,
     description: DescriptionFile = None,
     receivers: Annotated[
         Path | None,
-        typer.Option(metavar="YAML", help="Keys of a scenario's `receivers`; default: its own."),
+        typer.Option(
+            metavar="YAML", help="Keys of a scenario's `receivers`.", show_default="theirs"
+        ),
     ] = None,
 ) -> None:
-    """Sense with the active terminal's receiver in measured samples: detections, the range-Doppler
-    map and a picture over azimuth."""
+    """Detect targets in measured samples with the active receiver. Writes detections, the
+    range-Doppler map and the range-azimuth map."""
     import numpy as np
 
     from isac_rt.capture.sense import as_dataset, range_azimuth, sense

@@ -26,28 +26,39 @@ from isac_rt.cli.interruption import Terminated, say_interrupted
 from isac_rt.runtime import UserError, of_machine, settle_process, shut_out_working_folder
 
 DEBUG = "ISAC_RT_DEBUG"
-COMMANDS: dict[Callable[..., None], str] = {
-    simulation.run: "run scenes/munich_swarm.yaml --out runs/munich --set noise.tx_power_dbm=20",
-    simulation.demo: "demo --out first_look",
-    simulation.plan: "plan scenes/munich_swarm.yaml --set accuracy.preset=everything",
-    simulation.paths: "paths scenes/street_canyon.yaml --frame 3 --out paths.nc",
-    simulation.view: "view scenes/street_canyon.yaml --out scene.html",
-    simulation.animate: "animate runs/munich --out runs/munich/run.mp4",
-    simulation.figures: "figures runs/munich --as svg --style column",
-    simulation.export: "export runs/munich --as csv --out tables",
-    sweeps.sweep: "sweep scenes/sweeps/canyon_power.yaml --workers 2",
-    sweeps.dataset: "dataset scenes/sweeps/canyon_dataset.yaml --workers 2",
-    studies.reproduce: "reproduce table1 fig8 --quick",
-    studies.validate: "validate --quick --only geometry",
-    studies.bench: "bench synthesis --quick",
-    captures.import_: "import adc_data.bin --description board.yaml --out cube.nc",
-    captures.calibrate: "calibrate cube.nc --out board.cal --json",
-    captures.receive: "receive cube.nc --calibration board.cal --out runs/measured",
-    setting_up.doctor: "doctor",
-    setting_up.new: "new mine.yaml --footprints buildings.geojson",
-    setting_up.schema: "schema > scenario.schema.json",
+PANELS: dict[str, dict[Callable[..., None], str]] = {
+    "Run a scenario": {
+        simulation.run: "run scenes/munich_swarm.yaml --out runs/munich "
+        "--set noise.tx_power_dbm=20",
+        simulation.demo: "demo --out first_look",
+        simulation.plan: "plan scenes/munich_swarm.yaml --set accuracy.preset=everything",
+        sweeps.sweep: "sweep scenes/sweeps/canyon_power.yaml --workers 2",
+        sweeps.dataset: "dataset scenes/sweeps/canyon_dataset.yaml --workers 2",
+    },
+    "Look at a scenario or a run": {
+        simulation.view: "view scenes/street_canyon.yaml --out scene.html",
+        simulation.figures: "figures runs/munich --as svg --style column",
+        simulation.animate: "animate runs/munich --out runs/munich/run.mp4",
+        simulation.paths: "paths scenes/street_canyon.yaml --frame 3 --out paths.nc",
+        simulation.export: "export runs/munich --as csv --out tables",
+    },
+    "Studies and checks": {
+        studies.reproduce: "reproduce table1 fig8 --quick",
+        studies.validate: "validate --quick --only geometry",
+        studies.bench: "bench synthesis --quick",
+    },
+    "Radar boards": {
+        captures.import_: "import adc_data.bin --description board.yaml --out cube.nc",
+        captures.calibrate: "calibrate cube.nc --out board.cal --json",
+        captures.receive: "receive cube.nc --calibration board.cal --out runs/measured",
+    },
+    "Set-up": {
+        setting_up.new: "new mine.yaml --footprints buildings.geojson",
+        setting_up.doctor: "doctor",
+        setting_up.schema: "schema > scenario.schema.json",
+    },
 }
-"""The commands, each with an example of its use."""
+"""The commands by panel of ``--help``, each with an example of its use."""
 
 
 class _Commands(typer.core.TyperGroup):
@@ -59,7 +70,7 @@ class _Commands(typer.core.TyperGroup):
     def get_command(self, ctx: Any, name: str) -> Any:
         if name not in self.commands and name in registry.COMMANDS.installed():
             alone = typer.Typer(add_completion=False)
-            alone.command(name)(registry.COMMANDS.load(name))
+            alone.command(name, rich_help_panel="Other packages")(registry.COMMANDS.load(name))
             self.add_command(typer.main.get_command(alone), name)
         return super().get_command(ctx, name)
 
@@ -67,12 +78,16 @@ class _Commands(typer.core.TyperGroup):
 app = typer.Typer(
     cls=_Commands, add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False
 )
-for _command, _example in COMMANDS.items():
-    app.command(
-        _command.__name__.rstrip("_"),
-        help=" ".join(str(_command.__doc__).split()),
-        epilog=f"Example: isac-rt {_example}",
-    )(_command)
+for _panel, _commands in PANELS.items():
+    for _command, _example in _commands.items():
+        _text = " ".join(str(_command.__doc__).split())
+        app.command(
+            _command.__name__.rstrip("_"),
+            help=_text,
+            short_help=_text.split(". ")[0].rstrip(".") + ".",
+            epilog=f"Example: isac-rt {_example}",
+            rich_help_panel=_panel,
+        )(_command)
 
 
 def _print_versions(wanted: bool) -> None:
@@ -95,7 +110,7 @@ def _options(
         ),
     ] = False,
 ) -> None:
-    """Integrated sensing and communication of a UAV swarm over a ray-traced city."""
+    """Simulate integrated sensing and communication of a UAV swarm in a ray-traced city."""
 
 
 def _say_warning(message: Warning | str, category: type[Warning], *_: Any) -> None:

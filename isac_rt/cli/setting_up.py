@@ -13,7 +13,7 @@ from isac_rt.cli.console import say, say_table, working
 
 
 def doctor() -> None:
-    """Back end, LLVM, memory, threads, and what to install."""
+    """Print back end, LLVM, memory and threads, and what to install."""
     with working("looking at the machine"):
         from isac_rt import runtime
 
@@ -32,7 +32,7 @@ def doctor() -> None:
 
 
 def schema() -> None:
-    """JSON Schema of the scenario, for editors."""
+    """Print the JSON Schema of the scenario, for editors."""
     from isac_rt.cli.starter import schema_text
 
     typer.echo(schema_text(), nl=False)
@@ -49,14 +49,14 @@ def new(
     ] = None,
     crs: Annotated[
         str | None,
-        typer.Option(metavar="EPSG:N", help="Their coordinates, where the file does not say."),
+        typer.Option(metavar="EPSG:N", help="Coordinate system of a file that states none."),
     ] = None,
     terrain: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Heights of the ground, as GeoTIFF.")
+        Path | None, typer.Option(metavar="FILE", help="Heights of the ground, a GeoTIFF.")
     ] = None,
 ) -> None:
-    """Write a commented scenario to start from, over a street canyon or over your own buildings,
-    and the schema for editors; over buildings also a picture."""
+    """Write a commented scenario to start from, in a street canyon or among your own buildings.
+    Adds the schema for editors and, among buildings, a picture."""
     if footprints is None and (crs or terrain):
         raise InputProblem("--crs and --terrain are of --footprints; give it too")
     with working("writing the scenario"):

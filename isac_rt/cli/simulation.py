@@ -29,32 +29,35 @@ if TYPE_CHECKING:
 def run(
     scenario: ScenarioFile,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where the results go; default runs/NAME.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder of the results.", show_default="runs/NAME"),
     ] = None,
-    frames: Annotated[int | None, typer.Option(help="Simulate so many frames.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Replace the scenario's seed.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="Frames to simulate.", show_default="the scenario's")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed.", show_default="the scenario's")] = None,
     snapshots: Annotated[
-        int, typer.Option(min=1, help="Frames of which maps and path ledger are kept.")
+        int, typer.Option(min=1, help="Frames whose maps and paths are kept.")
     ] = 3,
     check_budget: Annotated[
         bool,
         typer.Option(
             "--check-budget",
-            help="Afterwards measure what was left out on sampled frames; into summary.json.",
+            help="Measure the error of omitted paths on sampled frames; into summary.json.",
         ),
     ] = False,
     restart: Annotated[
         bool,
-        typer.Option("--restart", help="Let go of frames that a stopped run kept in DIR."),
+        typer.Option("--restart", help="Discard the frames that a stopped run saved in DIR."),
     ] = False,
     overwrite: Annotated[
         bool,
-        typer.Option("--overwrite", help="Replace the results of another scenario in DIR."),
+        typer.Option("--overwrite", help="Overwrite the results of another scenario in DIR."),
     ] = False,
     overrides: Overrides = None,
 ) -> None:
-    """Simulate a scenario: results, summary, figures and a report. After a stop the same command
-    goes on."""
+    """Simulate a scenario and write results, figures and a report. After a stop the same command
+    resumes it."""
     from isac_rt.scenario.file import load
 
     loaded = load(scenario, overrides or (), frames, seed)
@@ -72,10 +75,10 @@ def run(
 
 def demo(
     out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Where the scenario and its results go.")
+        Path, typer.Option(metavar="DIR", help="Folder of the scenario and its results.")
     ] = Path("isac_rt_demo"),
 ) -> None:
-    """Simulate a small scene over a street canyon; needs no file. The scenario is written beside
+    """Simulate a small scenario in a street canyon; needs no file. The scenario is written next to
     its results, to be changed and run again."""
     from isac_rt.cli.starter import write_starter
 
@@ -110,7 +113,7 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
     _say_coverage(asdict(setup.coverage))
     _say_budget(budget)
     if resume.begun:
-        err().print(f"going on after the frames in {resume.file}", soft_wrap=True)
+        err().print(f"resuming after the frames saved in {resume.file}", soft_wrap=True)
 
     def simulated(report: Report) -> Results:
         def progress(done: int, total: int) -> None:
@@ -195,11 +198,10 @@ def _say_budget(rows: list[Any]) -> None:
 
 
 _PLAN_WORDS = (
-    "Errors are estimates from a few frames. rad: of a path's phase; dB: power left out, over the "
-    "noise of a cell of the range-Doppler map of one antenna; relative: of the samples. A plane "
-    "wavefront turns no phase by its curvature; a straight flight has no acceleration within the "
-    "frame. Too weak: together with all others in its range cell; out of reach: its beat is "
-    "stopped by the IF filter."
+    "Errors are estimated on a few frames. rad: phase of a path; dB: omitted power over the noise "
+    "of a range-Doppler cell of one antenna; relative: share of the samples. Plane wavefront: "
+    "curvature neglected; straight flight: acceleration within the frame neglected. Too weak: "
+    "together with all others in its range cell; out of reach: beat frequency above the IF filter."
 )
 """Explanation of the table of the plan."""
 
@@ -251,11 +253,11 @@ def _say_causes(whole: str, parts: Mapping[str, float]) -> None:
 
 def plan(
     scenario: ScenarioFile,
-    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     overrides: Overrides = None,
 ) -> None:
-    """Show what a run will model, what it leaves out and why, and the estimated error of each;
-    traces a few frames only."""
+    """Show coverage, modelled and omitted effects and their estimated errors. Traces a few frames
+    only."""
     from isac_rt.scenario.file import load
 
     loaded = load(scenario, overrides or ())
@@ -304,10 +306,10 @@ def _say_plan(found: dict[str, Any]) -> None:
 def paths(
     scenario: ScenarioFile,
     frame: FrameNumber,
-    out: Annotated[Path, typer.Option(metavar="FILE.nc", help="Where the ledger goes.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.nc", help="NetCDF file to write.")],
     overrides: Overrides = None,
 ) -> None:
-    """Write the path ledger of a frame, all links."""
+    """Write the propagation paths of one frame, all links, as NetCDF."""
     from isac_rt.scenario.file import load
 
     loaded = load(scenario, overrides or ())
@@ -330,7 +332,7 @@ def view(
     scenario: ScenarioFile,
     out: Annotated[
         Path,
-        typer.Option(metavar="FILE", help="A .png, or an .html page with the scene to turn about."),
+        typer.Option(metavar="FILE", help="A .png picture, or an .html page with a 3-D scene."),
     ],
     frame: FrameNumber = 0,
     overrides: Overrides = None,
@@ -363,17 +365,19 @@ def view(
 
 def animate(
     folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="What `isac-rt run --snapshots N` wrote.")
+        Path, typer.Argument(metavar="DIR", help="Folder of a run with --snapshots 20 or more.")
     ],
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A .gif or an .mp4; default DIR/run.gif.")
+        Path | None,
+        typer.Option(metavar="FILE", help="A .gif or an .mp4.", show_default="DIR/run.gif"),
     ] = None,
     observer: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Whose map; default the first.")
+        str | None,
+        typer.Option(metavar="NAME", help="Link whose map is shown.", show_default="the first"),
     ] = None,
-    rate: Annotated[float, typer.Option(min=0.1, max=60, help="Pictures per second.")] = 5.0,
+    rate: Annotated[float, typer.Option(min=0.1, max=60, help="Frames per second.")] = 5.0,
 ) -> None:
-    """Draw a run as a moving picture: the swarm with tracks, and a range-Doppler map, in step."""
+    """Animate a run: the swarm with tracks beside a range-Doppler map."""
     from isac_rt.results.files import open_results
 
     results = open_results(folder)
@@ -393,19 +397,20 @@ def animate(
 
 
 def figures(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="What `isac-rt run` wrote.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")],
     form: Annotated[str, typer.Option("--as", metavar="FORM", help="png, svg or pdf.")] = "pdf",
     style: Annotated[
         str,
-        typer.Option(help="screen; page: both columns of a journal's page; column: one of them."),
-    ] = "page",
+        typer.Option(help="screen; wide: 7.16 inch, two columns of a journal; column: 3.5 inch."),
+    ] = "wide",
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Where they go; default DIR/figures_STYLE."),
+        typer.Option(
+            metavar="DIR", help="Folder of the figures.", show_default="DIR/figures_STYLE"
+        ),
     ] = None,
 ) -> None:
-    """Draw the figures of a run anew, for a paper: SVG or PDF, sizes and fonts by style; maps of
-    every snapshot."""
+    """Draw the figures of a run for a paper. PDF, SVG or PNG, with maps of every snapshot."""
     from isac_rt.results.files import open_results
 
     results = open_results(folder)
@@ -422,28 +427,29 @@ def figures(
 
 
 def export(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="What `isac-rt run` wrote.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")],
     form: Annotated[
         str,
         typer.Option(
             "--as",
             metavar="FORMAT",
-            help="csv: tables; mat: for MATLAB; glb: city, flights, tracks and paths in 3-D; "
-            "stonesoup: detections; sigmf: IF samples of one frame.",
+            help="csv: tables; mat: MATLAB; glb: 3-D scene; stonesoup: detections; sigmf: IF "
+            "samples of one frame.",
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where the files go; default DIR/export.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder of the files.", show_default="DIR/export"),
     ] = None,
     frame: Annotated[
-        int | None, typer.Option(min=0, help="Of which frame, for sigmf; default the first.")
+        int | None, typer.Option(min=0, help="Frame, for sigmf.", show_default="the first")
     ] = None,
     link: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Whose samples, for sigmf; default the first."),
+        typer.Option(metavar="NAME", help="Link, for sigmf.", show_default="the first"),
     ] = None,
 ) -> None:
-    """Write a run for other programs; IF samples are made anew from the run's scenario."""
+    """Write a run for other programs. IF samples are simulated anew."""
     from isac_rt.results.files import open_results
     from isac_rt.views import export as exports
 

@@ -38,19 +38,21 @@ def _from_checkout(folder: str) -> None:
 def reproduce(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="NAME", help="Tables, figures and claims; none: list them."),
+        typer.Argument(metavar="NAME", help="Tables, figures and claims; without any: list them."),
     ] = None,
     quick: Quick = False,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Where the files go; default runs/reproduction/NAME."),
+        typer.Option(
+            metavar="DIR", help="Folder of the files.", show_default="runs/reproduction/NAME"
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 20260,
     seeds: Annotated[
-        int | None, typer.Option(min=1, max=1000, help="Flights of each place, for city.")
+        int | None, typer.Option(min=1, max=1000, help="Flights at each place, for city.")
     ] = None,
 ) -> None:
-    """Run the paper's tables, figures and claims again and judge them."""
+    """Reproduce tables, figures and claims of the paper and judge them."""
     _from_checkout("reproduce")
     from reproduce import TITLES
     from reproduce import names as experiments
@@ -99,7 +101,7 @@ def validate(
         str, typer.Option(metavar="WORDS", help="Only cases with these words in group or name.")
     ] = "",
 ) -> None:
-    """Hold every physical and numerical claim of the program against an independent truth."""
+    """Check every physical and numerical claim against an independent truth."""
     _from_checkout("tests")
     from truths import all_cases
     from truths.table import write_json, write_markdown
@@ -165,18 +167,18 @@ def _validate(cases: list[Any]) -> list[Any]:
 def bench(
     stages: Annotated[
         list[str] | None,
-        typer.Argument(metavar="STAGE", help="From synthesis to hermespy; all by default."),
+        typer.Argument(metavar="STAGE", help="Stages to run, from synthesis to hermespy."),
     ] = None,
     quick: Quick = False,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where tables and figures go.")] = Path(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of tables and figures.")] = Path(
         "runs/bench"
     ),
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the rows to a file too.")
     ] = None,
 ) -> None:
-    """Speed against error, method by method. Cost is in floors: one floor is the processor time to
-    fill one cube of samples and transform it once, measured in the same run."""
+    """Measure speed against error of each method. Cost is in floors: one floor is the processor
+    time to fill one cube of samples and transform it once, measured in the same run."""
     _from_checkout("benchmarks")
     from benchmarks import command, report
     from isac_rt.results.files import check_folder

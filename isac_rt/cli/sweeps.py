@@ -17,10 +17,11 @@ if TYPE_CHECKING:
     from isac_rt.sweep.definition import Plan
 
 Workers = Annotated[
-    int | None, typer.Option(min=1, help="Processes; default one per core, as memory allows.")
+    int | None,
+    typer.Option(min=1, help="Processes.", show_default="one per core, as memory allows"),
 ]
 Scheduler = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use instead.")
+    str | None, typer.Option(metavar="ADDRESS", help="Run on this Dask scheduler instead.")
 ]
 
 
@@ -29,21 +30,23 @@ def sweep(
         Path | None, typer.Argument(metavar="SWEEP", help="The sweep, a YAML file.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where the outcomes go; default runs/NAME.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder of the outcomes.", show_default="runs/NAME"),
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     max_points: Annotated[
-        int, typer.Option(min=1, help="Refuse a sweep with more points.")
+        int, typer.Option(min=1, help="Largest number of points accepted.")
     ] = 100_000,
     retry_failed: Annotated[
-        bool, typer.Option("--retry-failed", help="Run points again that failed.")
+        bool, typer.Option("--retry-failed", help="Run failed points again.")
     ] = False,
     status: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Only say how far the sweep in DIR is.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Print the progress of the sweep in DIR and end."),
     ] = None,
 ) -> None:
-    """Run a sweep, or what is missing of it: the same command again goes on."""
+    """Run a parameter sweep. After a stop the same command computes the missing points."""
     if (file is None) == (status is None):
         raise InputProblem(
             "isac-rt sweep needs either a sweep file or --status DIR; give one of them"
@@ -122,13 +125,14 @@ def _say_status(folder: Path) -> None:
 def dataset(
     file: Annotated[Path, typer.Argument(metavar="DATASET", help="The data set, a YAML file.")],
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where it goes; default runs/NAME.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder of the data set.", show_default="runs/NAME"),
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Draw many scenes and keep maps, paths, truth, tracks and bits for learning, or make what is
-    missing: the same command again goes on."""
+    """Simulate random scenes as a data set for machine learning. Keeps maps, paths, truth, tracks
+    and bits; after a stop the same command computes the missing scenes."""
     from isac_rt.results.files import check_folder
 
     with working("drawing the scenes"):

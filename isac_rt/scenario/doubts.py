@@ -34,14 +34,22 @@ PLAUSIBLE: dict[Key, tuple[float, float, str]] = {
 }
 """Least and greatest value that raises no doubt, and the unit of the key."""
 PLAUSIBLE_RCS = (-90.0, 70.0)
-
-
 FASTEST_MPS = 200.0
 FARTHEST_M = 1e5
 
 
 def doubts(scenario: Scenario) -> Iterator[Problem]:
-    """List what a person should be asked about a scenario."""
+    """List what a person should be asked about a scenario, equal doubts as one."""
+    found: dict[str, list[Key]] = {}
+    for doubt in (*_doubts_of_keys(scenario), *_doubts_of_flights(scenario)):
+        found.setdefault(doubt.text, []).extend(doubt.keys)
+    for text, keys in found.items():
+        others = list(dict.fromkeys(str(key[1]) for key in keys if key[0] == "swarm"))[1:]
+        likewise = f" (likewise {', '.join(others)})" if others else ""
+        yield Problem(tuple(keys), text + likewise)
+
+
+def _doubts_of_keys(scenario: Scenario) -> Iterator[Problem]:
     for (a, first), (b, second) in combinations(scenario.first_blocks().items(), 2):
         if abs(first - second) < scenario.radio.groups:
             said = f"{b} and {a} send in the same resource blocks; shall they collide?"
@@ -63,10 +71,10 @@ def doubts(scenario: Scenario) -> Iterator[Problem]:
             "never acts: it needs the pseudo_random schedule and velocities from sparse sampling, "
             "by OMP",
         )
-    yield from _doubts_of_flights(scenario)
 
 
 def _doubts_of_flights(scenario: Scenario) -> Iterator[Problem]:
+    """List the doubts about each UAV: its RCS, its fastest segment, its farthest waypoint."""
     low, high = PLAUSIBLE_RCS
     centre, what = (0.0, 0.0, 0.0), "the origin"
     if scenario.city is not None and scenario.city.file is not None:
@@ -80,26 +88,30 @@ def _doubts_of_flights(scenario: Scenario) -> Iterator[Problem]:
                 "square metre?",
             )
         speeds: dict[Key, float] = {}
-        places: dict[Key, tuple[float, ...]] = {}
+        distances: dict[Key, float] = {}
         if uav.waypoints is None:
             speeds["swarm", name, "velocity_mps"] = math.hypot(*uav.velocity_mps)
-            places["swarm", name, "position_m"] = uav.place(0.0)
+            distances["swarm", name, "position_m"] = math.dist(uav.place(0.0), centre)
         else:
             for i, (a, b) in enumerate(pairwise(uav.waypoints), start=1):
                 speed = math.dist(a.position_m, b.position_m) / (b.time_s - a.time_s)
                 speeds["swarm", name, "waypoints", i] = speed
             for i, w in enumerate(uav.waypoints):
-                places["swarm", name, "waypoints", i, "position_m"] = w.position_m
-        for key, speed in speeds.items():
-            if speed > FASTEST_MPS:
-                said = f"flies at {speed:.4g} m/s, more than {FASTEST_MPS:g}"
-                yield Problem((key,), f"{said}; is it in metres and seconds?")
-        for key, place in places.items():
-            if math.dist(place, centre) > FARTHEST_M:
-                said = (
-                    f"lies {math.dist(place, centre):.4g} m from {what}, more than {FARTHEST_M:g}"
-                )
-                yield Problem((key,), f"{said}; is it in metres?")
+                distance = math.dist(w.position_m, centre)
+                distances["swarm", name, "waypoints", i, "position_m"] = distance
+        for values, most, said, units in (
+            (speeds, FASTEST_MPS, "flies at {:.4g} m/s", "metres and seconds"),
+            (distances, FARTHEST_M, f"lies {{:.4g}} m from {what}", "metres"),
+        ):
+            exceeding = {key: value for key, value in values.items() if value > most}
+            if not exceeding:
+                continue
+            worst = max(exceeding, key=exceeding.__getitem__)
+            count = f", and above it {len(exceeding)} times" if len(exceeding) > 1 else ""
+            yield Problem(
+                (worst,),
+                f"{said.format(values[worst])}, more than {most:g}{count}; is it in {units}?",
+            )
 
 
 def _middle(scenario: Scenario) -> tuple[float, float, float]:

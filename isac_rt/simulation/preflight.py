@@ -263,20 +263,22 @@ def warn_of_unseen(seen: Coverage) -> None:
         elif row.beyond_range:
             _warn(
                 f"{rx} is beyond {limits[row.link].max_range_m:.4g} m from {tx} in "
-                f"{row.beyond_range} of {row.frames} frames, where it loses the line of sight and "
-                "every data symbol; fly it nearer, raise radio.samples_per_chirp or lower "
-                "radio.bandwidth_hz"
+                f"{row.beyond_range} of {row.frames} frames, where it receives no data; fly it "
+                "nearer, raise radio.samples_per_chirp or lower radio.bandwidth_hz"
             )
         elif row.unseen == row.frames:
             _warn(
                 f"{rx} never sees {tx}, {_causes(row)}: it gets no data; turn the boresight of "
                 "one of them, or move it"
             )
+    unseen: dict[str, list[str]] = {}
     for name, rows in by_uav.items():
         others = [link for link in limits if link.partition("->")[2] != name]
         if len(rows) == len(others) and all(row.unseen == row.frames for row in rows):
             causes = "; ".join(f"{row.link.replace('->', ' to ')}: {_causes(row)}" for row in rows)
-            _warn(f"{name} is seen by no terminal in any frame ({causes}); move or turn it or them")
+            unseen.setdefault(causes, []).append(name)
+    for causes, names in unseen.items():
+        _warn(f"no terminal ever sees {', '.join(names)} ({causes}); move or turn it or them")
 
 
 def _warn(said: str) -> None:

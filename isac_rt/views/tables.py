@@ -205,22 +205,22 @@ def link_words(name: str) -> str:
     return name.replace("->", " to ")
 
 
-_SEES = {
-    "Range to [m]": "max_range_m",
-    "Range cell [m]": "range_resolution_m",
-    "Velocity to [m/s]": "max_velocity_mps",
-    "Velocity cell [m/s]": "velocity_resolution_mps",
-    "Azimuth beam [deg]": "azimuth_resolution_deg",
-    "Elevation beam [deg]": "elevation_resolution_deg",
-    "View to [deg]": "field_of_view_deg",
+_COVERAGE = {
+    "Max range [m]": "max_range_m",
+    "Range resolution [m]": "range_resolution_m",
+    "Max velocity [m/s]": "max_velocity_mps",
+    "Velocity resolution [m/s]": "velocity_resolution_mps",
+    "Azimuth beamwidth [deg]": "azimuth_resolution_deg",
+    "Elevation beamwidth [deg]": "elevation_resolution_deg",
+    "Field of view [deg]": "field_of_view_deg",
     "Bit rate [kbit/s]": "bit_rate_bps",
 }
 _OUTSIDE = ("out_of_view", "beyond_range", "too_near", "too_fast")
 
 
 def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
-    """Tabulate the coverage of the radar: one row for each set of links that see alike, the times
-    and what the columns mean in words, and the frames in which UAVs are outside.
+    """Tabulate the coverage of the radar: a row for the links of equal limits, an explanation with
+    the times, and the frames in which UAVs are outside.
 
     Parameters
     ----------
@@ -232,10 +232,12 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
             **of,
             "bit_rate_bps": None if of["bit_rate_bps"] is None else of["bit_rate_bps"] / 1e3,
         }
-        alike.setdefault(tuple(number(row[key]) for key in _SEES.values()), []).append(
+        alike.setdefault(tuple(number(row[key]) for key in _COVERAGE.values()), []).append(
             link_words(of["link"])
         )
-    limits = Table(("Sees", *_SEES), [(", ".join(names), *row) for row, names in alike.items()])
+    limits = Table(
+        ("Coverage", *_COVERAGE), [(", ".join(names), *row) for row, names in alike.items()]
+    )
     farthest = max(seen["links"], key=lambda of: of["max_range_m"])
     slot, frame, interval = (
         number(seen[key] * unit)
@@ -243,17 +245,13 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
     )
     past = ""
     if farthest["filtered_range_m"] > farthest["max_range_m"]:
-        past = (
-            ", and hold with data as without; paths of up to twice that range still disturb some "
-            "chirps"
-        )
+        past = "; echoes from up to twice the maximum range disturb some chirps"
     words = (
-        f"A slot, one chirp of each group, lasts {slot} us, a frame {frame} ms; a frame begins "
-        f"every {interval} ms. Ranges are one way for echoes, the whole way from transmitter to "
-        f"receiver otherwise{past}. Faster UAVs are seen at a wrong velocity. A beam is the width "
-        "of the array's main lobe ahead; the view reaches so far to each side, and directions are "
-        f"unambiguous to {number(farthest['unambiguous_angle_deg'])} deg. Walls in between are "
-        "not counted here."
+        f"A slot (one chirp of each group) lasts {slot} us, a frame {frame} ms, and one starts "
+        f"every {interval} ms. Range: one way for echoes, path length between two terminals{past}. "
+        "Faster UAVs alias in velocity. Beamwidth: of the array's main lobe at boresight. Field of "
+        f"view: to each side; directions are unambiguous to "
+        f"{number(farthest['unambiguous_angle_deg'])} deg. Occlusion is not considered here."
     )
     rows = [
         (
@@ -263,7 +261,14 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
         )
         for row in seen["outside"]
     ]
-    titles = ("Frames outside", "Out of view", "Beyond range", "Too near", "Too fast", "Of frames")
+    titles = (
+        "Frames outside",
+        "Field of view",
+        "Beyond range",
+        "Too near",
+        "Too fast",
+        "Of frames",
+    )
     return limits, words, Table(titles, rows)
 
 

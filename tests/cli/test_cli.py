@@ -352,6 +352,31 @@ def test_warnings_are_said_as_they_stand(scenario_file, simulation, tmp_path, ca
     assert "warning [bold]not[/] markup" in capsys.readouterr().err
 
 
+def test_the_help_groups_the_commands_in_80_columns(capsys, monkeypatch):
+    """Every command stands in one panel with one sentence on at most two lines. Planted bugs: a
+    command without a panel, which stands among "Commands"; help of four sentences."""
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80 and len(lines) < 60
+    titles = [line.strip("\u256d\u2500\u256e ") for line in lines if line.startswith("\u256d")]
+    assert titles == ["Options", *isac_rt.cli.cli.PANELS]
+
+
+def test_help_shows_every_default(capsys, monkeypatch):
+    """What stands for a missing option. Planted bug: an option with a default of None whose help
+    does not say what happens without it."""
+    monkeypatch.setenv("COLUMNS", "200")
+    for name, defaults in (
+        ("run", ("runs/NAME", "the scenario's", "default: 3")),
+        ("figures", ("default: pdf", "default: wide", "DIR/figures_STYLE")),
+        ("animate", ("DIR/run.gif", "default: 5.0", "the first")),
+    ):
+        assert main([name, "--help"]) == 0
+        said = capsys.readouterr().out
+        assert all(default in said for default in defaults), name
+
+
 def test_help_of_every_command_says_its_options(capsys):
     for name, option in (("run", "--set"), ("sweep", "--retry-failed"), ("bench", "--json")):
         assert main([name, "--help"]) == 0
@@ -399,7 +424,11 @@ def test_where_no_terminal_shows_a_bar_lines_come(capsys, monkeypatch):
     assert len(said) == 2
 
 
-@pytest.mark.parametrize("command", isac_rt.cli.cli.COMMANDS, ids=lambda c: c.__name__)
+@pytest.mark.parametrize(
+    "command",
+    [command for panel in isac_rt.cli.cli.PANELS.values() for command in panel],
+    ids=lambda c: c.__name__,
+)
 def test_help_of_every_command_gives_an_example(command, capsys, monkeypatch):
     """Of that command, with options that it has and files that there are. Planted bug: an option
     of another command."""

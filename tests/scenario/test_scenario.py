@@ -441,6 +441,26 @@ def test_units_wrong_by_a_thousand_are_doubted(tmp_path, option, said):
         load(path, [option])
 
 
+def test_equal_doubts_are_one(recwarn):
+    """One line for each flight and cause: 600 waypoints 300 m apart in 0.1 s, the farthest after
+    180 km; two UAVs of one speed share a line. Planted bugs: a line for each waypoint; the first
+    waypoint that is too far for the farthest."""
+    points = [{"time_s": i * 0.1, "position_m": [3, i * 300.0, 50 + i]} for i in range(600)]
+    fast = {"role": "passive", "velocity_mps": [0, 900, 0]}
+    swarm = {
+        "AT": {"role": "active", "position_m": [0, 0, 50]},
+        "PT1": fast | {"position_m": [0, 90, 50]},
+        "PT2": fast | {"position_m": [0, 99, 50]},
+        "U1": {"role": "target", "waypoints": points},
+    }
+    load({"name": "x", "frames": 4, "swarm": swarm})
+    said = [str(w.message) for w in recwarn if issubclass(w.category, ScenarioWarning)]
+    assert len(said) == 3
+    assert "900 m/s" in said[0] and said[0].endswith("(likewise PT2)")
+    assert "3000 m/s" in said[1] and "599 times" in said[1]
+    assert "1.797e+05 m from the origin" in said[2] and "266 times" in said[2]
+
+
 def test_a_tree_made_in_python_is_checked_too():
     with pytest.raises(ValidationError, match="no UAV has the role active"):
         Scenario(

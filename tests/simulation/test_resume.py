@@ -508,7 +508,7 @@ def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsy
     assert "keeps frames of another" in said and progress == "loading the program"
     assert (tmp_path / "out" / FILE).read_bytes() == kept
     assert main(command) == 0
-    assert "going on after the frames" in capsys.readouterr().err
+    assert "resuming after the frames" in capsys.readouterr().err
     assert not (tmp_path / "out" / FILE).exists() and (tmp_path / "out" / "results.nc").exists()
     Resume(tmp_path / "out", "another").append(1)
     assert main([*other, "--restart"]) == 2
@@ -547,7 +547,7 @@ def test_whatever_ends_a_run_keeps_what_is_done(
     shown = capsys.readouterr().err
     assert said in shown and "keeps the frames so far" in shown and "Traceback" not in shown
     assert main(command) == 0
-    assert "going on after" in capsys.readouterr().err
+    assert "resuming after" in capsys.readouterr().err
 
 
 def test_a_run_on_a_full_disk_goes_on_once_there_is_room(tmp_path, small_disk, monkeypatch, capsys):
@@ -569,7 +569,7 @@ def test_a_run_on_a_full_disk_goes_on_once_there_is_room(tmp_path, small_disk, m
     assert [p.name for p in out.iterdir()] == [FILE] and "keeps the frames so far" in said
     subprocess.run(["mount", "-o", "remount,size=40m", str(disk)], check=True)
     assert main(command) == 0
-    assert "going on after" in capsys.readouterr().err
+    assert "resuming after" in capsys.readouterr().err
     assert_equal_results(open_results(out), simulate.run(dense_scenario(frames=5)))
 
 
@@ -608,6 +608,6 @@ sys.exit(main(["run", {str(scenario)!r}, "--out", {str(out)!r}]))
         assert child.returncode == 128 + how and "keeps the frames so far" in said
     assert (out / FILE).exists() and not (out / "results.nc").exists()
     again = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=300)
-    assert again.returncode == 0 and "going on after the frames" in again.stderr
+    assert again.returncode == 0 and "resuming after the frames" in again.stderr
     assert not (out / FILE).exists()
     assert_equal_results(open_results(out), simulate.run(dense_scenario(frames=8)))

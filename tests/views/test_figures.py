@@ -205,7 +205,7 @@ def test_figures_for_a_paper(run, tmp_path, form, capsys):
     if form == "svg":
         assert b'width="252pt"' in made[0]["errors.svg"]  # 3.5 inches
     assert main(["figures", str(tmp_path), "--style", "poster"]) == 2
-    assert "choose from screen, page, column" in capsys.readouterr().err
+    assert "choose from screen, wide, column" in capsys.readouterr().err
 
 
 def test_leakage_does_not_set_the_scale_of_a_map(run):
