@@ -18,8 +18,8 @@ from isac_rt.propagation.settings import Clutter
 from isac_rt.runtime import available_memory
 from isac_rt.scenario.tree import NEAREST_M
 from isac_rt.simulation.coverage import Coverage, Outside, unambiguous_velocity
-from isac_rt.world.city.mesh import CityMesh
-from isac_rt.world.passage import TOUCH_M, enclosed, first_passage
+from isac_rt.world.city.mesh import CityMesh, empty_city
+from isac_rt.world.passage import TOUCH_M, enclosed, first_passage, obstacles
 from isac_rt.world.settings import City
 from isac_rt.world.swarm import Pose, Swarm
 
@@ -134,14 +134,19 @@ def check_passage(swarm: Swarm, timetable: Timetable, city: CityMesh) -> None:
     ------
     ScenarioError
     """
+    begin, end = timetable.epoch(0), timetable.epoch(timetable.frames - 1)
+    starts = np.array([flight.pose(begin).position for flight in swarm.trajectories.values()])
+    inside = [enclosed(city, start) for start in starts - city.origin]
+    solid = obstacles(city, starts - city.origin) if any(inside) else empty_city("", city.origin)
+    turn = ", or turn the faces of a room inward" if all(inside) else ""
     for name, flight in swarm.trajectories.items():
-        times, places = flight.way(timetable.epoch(0), timetable.epoch(timetable.frames - 1))
+        times, places = flight.way(begin, end)
         way = places - city.origin
         keys = "waypoints" if swarm.uavs[name].waypoints else "position_m or velocity_mps"
-        if enclosed(city, way[0]):
+        if enclosed(solid, way[0]):
             raise ScenarioError(
                 f"swarm.{name}: starts inside a building of {city.name} or under its ground, at "
-                f"{_said(places[0])} m; change its {keys}"
+                f"{_said(places[0])} m; change its {keys}{turn}"
             )
         found = first_passage(city, _off_the_ends(way))
         if found is not None:

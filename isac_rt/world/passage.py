@@ -8,6 +8,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from isac_rt.world.city.mesh import CityMesh
 
@@ -87,6 +89,39 @@ def hits(corners: np.ndarray, start: np.ndarray, end: np.ndarray) -> tuple[np.nd
         share = (turned * second).sum(axis=1) / volume
         through = (u >= 0) & (v >= 0) & (u + v <= 1) & (share >= 0) & (share <= 1)
     return near[through], share[through]
+
+
+def obstacles(city: CityMesh, places: np.ndarray) -> CityMesh:
+    """Return the part of a city that bodies may not be enclosed by: all of it, but for a room that
+    encloses all of their places (N, 3), local.
+
+    A room is a connected surface as large as the whole mesh, so that nothing lies outside it, or
+    one whose faces look inward, unlike a building's.
+    """
+    sides = city.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(sides)), sides.T), shape=(len(city.vertices),) * 2)
+    _, part = connected_components(graph, directed=False)
+    low, high = city.bounds()
+    for one in np.unique(part[city.vertices.argmax(axis=0)]):
+        own = city.vertices[part == one]
+        if (own.min(axis=0) == low).all() and (own.max(axis=0) == high).all():
+            shell = part[city.faces[:, 0]] == one
+            if all(enclosed(city.of(shell), place) for place in places):
+                return city.of(~shell)
+    if all(enclosed(city, place) and _looks_inward(city, place) for place in places):
+        return city.of(np.zeros(city.num_faces, bool))
+    return city
+
+
+def _looks_inward(city: CityMesh, place: np.ndarray) -> bool:
+    """Return whether most of the faces that a place (3,) sees are seen from their front."""
+    reach = float(np.linalg.norm(np.ptp(city.vertices, axis=0)))
+    ahead = 0
+    for azimuth in 0.123 + np.arange(RING) * 2 * np.pi / RING:
+        along = np.array([np.cos(azimuth), np.sin(azimuth), LOW_RAD])
+        face, share = hits(city.corners, place, place + reach * along)
+        ahead += bool(face.size and city.normals[face[share.argmin()]] @ along < 0)
+    return 2 * ahead > RING
 
 
 def enclosed(city: CityMesh, place: np.ndarray) -> bool:

@@ -84,7 +84,7 @@ def test_a_transmitter_close_to_a_wall_or_on_it(gap):
     else:
         truth = chain_length((((1, 0, 0), (11.3, 0, 0)),), poses["A"].position, poses["P"].position)
         assert C * specular(paths).delay == pytest.approx([float(truth)], abs=NANOMETRE)
-    half = wall()._of(np.array([True, False]))
+    half = wall().of(np.array([True, False]))
     # in the wall's plane, beside the wall; and beyond the long side of half of it
     for city, place in ((wall(), (11.3, 33.0, 9.7)), (half, (11.3, -10.0, 25.0))):
         beyond = stage.swarm(place, (-3.3, 7.9, 8.8), FAR, moving=False)

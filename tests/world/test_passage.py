@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
+import trimesh
 
 from isac_rt.document import ScenarioError
 from isac_rt.scenario.file import load
@@ -190,6 +192,51 @@ def test_the_way_keeps_to_the_flight():
             assert np.linalg.norm(off) <= SAG_M
     straight = Trajectory(Uav(role="target", position_m=(0, 0, 9), velocity_mps=(3, 1, 0)))
     assert len(straight.way(0.0, 9.0)[0]) == 2
+
+
+ROOM = trimesh.creation.box((10, 8, 3)).apply_translation((0, 0, 1.5))
+CUPBOARD = trimesh.creation.box((2, 1, 2)).apply_translation((-3, 2, 1))
+GARDEN = trimesh.creation.box((60, 60, 1)).apply_translation((0, 0, -0.6))
+L_SHAPED = trimesh.creation.extrude_polygon(
+    shapely.Polygon([(-5, -4), (5, -4), (5, 0), (2, 0), (2, 4), (-5, 4)]), 3
+)
+INWARD = ROOM.copy()
+INWARD.invert()
+SWARM = {
+    "radar": {"role": "active", "position_m": [0, -3.5, 1.2], "boresight": [0, 1, 0]},
+    "person": {"role": "target", "position_m": [0.8, 1, 1.1], "velocity_mps": [0.3, -1, 0]},
+}
+
+
+def indoors(folder, *meshes, person=(0.8, 1, 1.1)):
+    trimesh.util.concatenate(meshes).export(folder / "room.obj")
+    swarm = SWARM | {"person": SWARM["person"] | {"position_m": list(person)}}
+    city = {"source": "mesh", "file": str(folder / "room.obj"), "up_axis": "z"}
+    prepare(load({"frames": 5, "sensor": "iwr6843", "city": city, "swarm": swarm}))
+
+
+@pytest.mark.parametrize(
+    "meshes", [(ROOM,), (ROOM, CUPBOARD), (L_SHAPED,), (INWARD,), (INWARD, CUPBOARD, GARDEN)]
+)
+def test_a_closed_room_is_a_place_to_fly_in(tmp_path, meshes):
+    """Where nothing lies outside it, or its walls look inward. It was refused as a building."""
+    indoors(tmp_path, *meshes)
+
+
+@pytest.mark.parametrize(
+    ("meshes", "person", "said"),
+    [
+        ((ROOM, CUPBOARD), (-3.1, 2.2, 1.1), "swarm.person: starts inside"),
+        ((ROOM,), (0.8, 9.7, 1.1), "swarm.radar: starts inside"),
+        ((ROOM, GARDEN), (0.8, 1, 1.1), "turn the faces of a room inward"),
+        ((L_SHAPED,), (3.5, 2.5, 1.1), "swarm.radar: starts inside"),
+    ],
+)
+def test_a_room_has_its_limits(tmp_path, meshes, person, said):
+    """In the cupboard, through the wall, in a house in a garden. Planted bug: a body outside does
+    not make the room a building."""
+    with pytest.raises(ScenarioError, match=said):
+        indoors(tmp_path, *meshes, person=person)
 
 
 @pytest.mark.parametrize(

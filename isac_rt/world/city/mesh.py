@@ -179,7 +179,7 @@ class CityMesh:
         near = corner.min(axis=1) <= radius
         if not near.all():  # few have an edge or a middle nearer than their corners
             near[~near] = distance_to_triangles(self.corners[~near], np.zeros(3)) <= radius
-        kept = self if near.all() else self._of(near)
+        kept = self if near.all() else self.of(near)
         beyond = self.num_beyond + int((~near).sum())
         return replace(kept, num_beyond=beyond, reach=min(radius, self.reach))
 
@@ -190,9 +190,9 @@ class CityMesh:
             return self
         places = self.corners[..., :2] + self.origin[:2]
         out = [((places > a[:2]) & (places < a[2:])).all(axis=(1, 2)) for a in map(np.array, areas)]
-        return self._of(~np.any(out, axis=0))
+        return self.of(~np.any(out, axis=0))
 
-    def _of(self, some: NDArray[np.bool_]) -> CityMesh:
+    def of(self, some: NDArray[np.bool_]) -> CityMesh:
         """Some of the faces, with what they need."""
         faces, face_material = self.faces[some], self.face_material[some]
         corners, numbers = np.unique(faces, return_inverse=True)
