@@ -232,8 +232,8 @@ def _likely_height(tags: Sequence[Tags]) -> str | None:
         if _CALLED_HEIGHT.search(str(name)) and not _OTHER_HEIGHT.search(str(name)):
             with suppress(ValueError):
                 found[str(name)] += bool(parse_length(value))
-    name, count = found.most_common(1)[0] if found else ("", 0)
-    return name[:60] if 2 * count > len(tags) else None
+    best, count = found.most_common(1)[0] if found else ("", 0)
+    return best[:60] if 2 * count > len(tags) else None
 
 
 def _most(left: Counter[str]) -> int:
