@@ -64,6 +64,21 @@ class OwnErrors:
     correction: Correction | None = None
 
 
+def _reception(made: Reception) -> Reception:
+    """Return what a receiver made of a frame.
+
+    Raises
+    ------
+    TypeError  If a custom receiver returned anything but a `Reception`.
+    """
+    if not isinstance(made, Reception):
+        raise TypeError(
+            f"receive returned {type(made).__name__}, not a Reception; return the one that "
+            "isac_rt.receive.types.Reception describes"
+        )
+    return made
+
+
 class ActiveTerminal(Stateful):
     """The AT: senses with its own echoes and tracks what it finds.
 
@@ -140,7 +155,7 @@ class ActiveTerminal(Stateful):
         own = Own(own_pose, time, mates, told)
         expect = self.equipment.expect_targets
         self._hints = Hints(clutter, None if expect is None else expect(self.tracker, own))
-        reception = self.receive(cube, payload, clutter, maps)
+        reception = _reception(self.receive(cube, payload, clutter, maps))
         if reception.correction is not None:
             before = before or Correction(0.0, np.zeros(3))
             self.state.correction = before.then(reception.correction)
@@ -305,7 +320,7 @@ class PassiveTerminal(Stateful):
     ) -> Reception:
         """`receive` between clocks that are set alike."""
         late = None if expected is None else delayed(expected, own.clock)
-        reception = self.receive(cube, late, modulated, maps)
+        reception = _reception(self.receive(cube, late, modulated, maps))
         return replace(reception, detections=delayed(reception.detections, own.clock, -1))
 
     def _track(self, reception: Reception, own: Own) -> None:

@@ -120,6 +120,18 @@ def test_any_object_with_receive_is_a_receiver():
     with pytest.raises(TypeError, match="is object, which has no receive"):
         run(scenario, terminal=lambda setup, link: object())
 
+    class Forgetful:
+        def receive(self, cube, *known):
+            Reception.undecoded(cube.waveform, no_detections())
+
+    for at in ("AT", "PT"):  # found at either end
+
+        def forgetful(setup, link, at=at):
+            return Forgetful() if link.rx == at else Deaf()
+
+        with pytest.raises(TypeError, match="returned NoneType, not a Reception"):
+            run(scenario, terminal=forgetful)
+
 
 def test_a_row_says_so_before_the_run():
     """Its elevation beam is none, and a run warns; bug: a beam of 90 degrees."""
