@@ -220,8 +220,8 @@ def buildings(
         raise CityError(f"{name}: there is no polygon of a building in it ({said}); give buildings")
     heights.tell(len(found) + len(parts), notes)
     missing = sum(outline.height is None for outline in (*found, *parts))
-    if 2 * missing > len(found) + len(parts) and (name := _likely_height(tags)):
-        notes.append(f"{name!r} looks like a height: is city.height_property: {name} meant?")
+    if 2 * missing > len(found) + len(parts) and (likely := _likely_height(tags)):
+        notes.append(f"{likely!r} looks like a height: is city.height_property: {likely} meant?")
     return [*_without_parts(found, parts, notes), *parts]
 
 
