@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import os
 import warnings
+from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from isac_rt.runtime import available_memory
 from isac_rt.scenario.tree import NEAREST_M
 from isac_rt.simulation.coverage import Coverage, Outside, unambiguous_velocity
 from isac_rt.world.city.mesh import CityMesh, empty_city
+from isac_rt.world.city.meshfiles import point_in_file
+from isac_rt.world.city.place import local_origin
 from isac_rt.world.passage import TOUCH_M, enclosed, first_passage, obstacles
 from isac_rt.world.settings import City
 from isac_rt.world.swarm import Pose, Swarm
@@ -183,13 +186,13 @@ def check_reach(settings: City | None, city: CityMesh, reach: float) -> None:
     )
     if ((low <= city.origin) & (city.origin <= high))[:2].all():
         return _warn(f"{said}; fly lower")
-    as_in_file = settings.source == "mesh" and settings.scale == 1 and settings.up_axis != "y"
-    point = np.append((low + high)[:2] / 2, low[2]) + (settings.origin or 0.0)
-    example = f", such as {_said(point.round())}" if as_in_file else ""
-    raise ScenarioError(
-        f"{said}; state as city.origin the point of a mesh or of footprints that becomes the "
-        f"world's origin{example}, or move the swarm"
-    )
+    point, where = np.append((low + high)[:2] / 2, low[2]), ""
+    if settings.source == "mesh":
+        where = _said(point_in_file(settings, Path(settings.file or ""), point))
+    elif city.place is not None:
+        where = str(list(local_origin(city.place, point)))
+    origin = "state the point of the file that becomes the world's origin, such as city.origin: "
+    raise ScenarioError(f"{said}; {f'{origin}{where}, or ' if where else ''}move the swarm")
 
 
 def _off_the_ends(way: np.ndarray) -> np.ndarray:

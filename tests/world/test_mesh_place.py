@@ -115,9 +115,18 @@ def test_a_city_out_of_reach_is_refused_with_its_origin(tmp_path):
     the check skipped where the whole mesh is asked for."""
     street().apply_translation(UTM).export(tmp_path / "utm.obj")
     for preset in ("budget", "everything"):
-        with pytest.raises(ScenarioError, match=r"such as \[690934\.0, 5334012\.0, 519\.0\]"):
+        with pytest.raises(
+            ScenarioError, match=r"such as city.origin: \[690934\.0, 5334012\.0, 519\.2\]"
+        ):
             prepare(scene(tmp_path, "utm.obj", preset))
     prepare(scene(tmp_path, "utm.obj", origin=UTM))
+    move = trimesh.transformations.translation_matrix(UTM)
+    street().apply_transform(np.diag([1e3, 1e3, 1e3, 1]) @ Y_UP @ move).export(tmp_path / "mm.obj")
+    with pytest.raises(ScenarioError, match="such as") as refused:
+        prepare(scene(tmp_path, "mm.obj", scale=1e-3, up_axis="y"))
+    stated = str(refused.value).partition("city.origin: [")[2].partition("]")[0]
+    origin = [float(number) for number in stated.split(",")]
+    prepare(scene(tmp_path, "mm.obj", scale=1e-3, up_axis="y", origin=origin))
     street().apply_translation((0, 0, -20_000)).export(tmp_path / "low.obj")
     with pytest.warns(ScenarioWarning, match="fly lower"):
         prepare(scene(tmp_path, "low.obj"))

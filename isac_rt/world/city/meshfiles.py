@@ -350,6 +350,14 @@ def mesh_place(city: settings.City, path: Path) -> Place | None:
     return Place("", city.origin) if plain and city.origin else None
 
 
+def point_in_file(
+    city: settings.City, path: Path, point: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return a world point (3,) [m] in the coordinates and units of a mesh file."""
+    turned = point @ _Y_UP_TO_Z_UP if _is_y_up(city, path) else point
+    return turned / city.scale + (city.origin or 0.0)
+
+
 def mesh_file(
     city: settings.City, path: Path
 ) -> tuple[list[Surface], list[str], Place | None, bool]:
