@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -197,7 +197,7 @@ def _sent(known: Known, separate: bool) -> _Sent:
     return _Sent(weight, time, tx, w.num_tx * (w.num_groups if separate else 1))
 
 
-def _rows_about(row: T, num_rows: int) -> tuple[T, T]:
+def _rows_about(row: Any, num_rows: int) -> tuple[Any, Any]:
     """First of the rows that a template at `row` covers, and their number."""
     low = np.maximum(row - HALF_WIDTH, 0)
     return low, np.minimum(row + HALF_WIDTH + 1, num_rows) - low

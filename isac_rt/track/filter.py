@@ -133,16 +133,16 @@ def transmitter_jacobian(state: np.ndarray, transmitter: np.ndarray) -> np.ndarr
 def measurement_covariance(
     std: np.ndarray, mean: np.ndarray, transmitter: Gaussian | None = None
 ) -> np.ndarray:
-    """R (4, 4) of a detection: its own deviations (4,), not below `STD_FLOOR`, and for a bistatic
-    one the uncertainty of the transmitter's track, seen from the body's state `mean`.
+    """R (..., 4, 4) of detections: their own deviations (..., 4), not below `STD_FLOOR`, and for
+    bistatic ones the uncertainty of the transmitter's track, seen from the targets' states `mean`.
 
     The transmitter's error is the same in successive frames, but is treated here as if it were
     drawn anew: a reflector's covariance is too small by what they share.
     """
-    R = np.diag(np.fmax(std, STD_FLOOR) ** 2)
+    R = np.fmax(std, STD_FLOOR)[..., None] ** 2 * np.eye(4)
     if transmitter is not None:
         J = transmitter_jacobian(mean, transmitter.mean)
-        R = R + J @ transmitter.covariance @ J.T
+        R = R + J @ transmitter.covariance @ np.swapaxes(J, -1, -2)
     return R
 
 
@@ -195,19 +195,16 @@ def update(
     *,
     ambiguity: Ambiguity = UNAMBIGUOUS,
 ) -> Gaussian:
-    """Condition on one measurement (4,) with covariance R (4, 4); components that are NaN were not
-    measured.
+    """Condition states (..., S) on a measurement (..., 4) each, with covariances R (..., 4, 4);
+    components that are NaN were not measured, the same ones in all.
 
     Iterated EKF: the measurement is linearised again at the new mean until it stands (Gauss-Newton
     on the posterior), because a range known to a millimetre across a direction known to a metre
     bends visibly. Joseph form. Of what the `ambiguity` leaves open the reading nearest in velocity
     counts.
     """
-    return _updated(g, measurement, R, _measured(measurement), own, transmitter, ambiguity)
-
-
-def _measured(measurement: np.ndarray) -> np.ndarray:
-    return np.flatnonzero(np.isfinite(measurement))
+    rows = np.flatnonzero(np.isfinite(measurement).reshape(-1, 4).all(axis=0))
+    return _updated(g, measurement, R, rows, own, transmitter, ambiguity)
 
 
 def _updated(
@@ -219,34 +216,39 @@ def _updated(
     transmitter: np.ndarray | None,
     ambiguity: Ambiguity,
 ) -> Gaussian:
-    """`update` by some `rows` of a measurement."""
+    """`update` by some `rows` of the measurements."""
 
     def seen(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         off = wrapped(measurement - measure(x, own, transmitter), ambiguity)
-        return off[rows], jacobian(x, own, transmitter)[rows]
+        return off[..., rows], jacobian(x, own, transmitter)[..., rows, :]
 
-    return conditioned(g, R[np.ix_(rows, rows)], seen)
+    return conditioned(g, R[..., rows[:, None], rows], seen)
 
 
 def conditioned(
     g: Gaussian, R: np.ndarray, seen: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 ) -> Gaussian:
-    """Condition states (S,) on a measurement (n,) of covariance R by the iterated EKF, in Joseph's
-    form: `seen` returns the measurement less what is expected at states, and the derivative (n, S)
-    of the latter."""
+    """Condition states (..., S) on measurements (..., n) of covariances R by the iterated EKF, in
+    Joseph's form: `seen` returns the measurements less what is expected at states, and the
+    derivatives (..., n, S) of the latter. Each state stays once it is settled."""
     mean, P = g
-    x, enough = mean, 1e-3 * np.sqrt(np.diag(P)) + ROUNDING
+    x, moving = mean, np.ones(mean.shape[:-1], bool)
+    enough = 1e-3 * np.sqrt(np.diagonal(P, axis1=-2, axis2=-1)) + ROUNDING
+    K, H = np.zeros((*mean.shape, R.shape[-1])), np.zeros((*R.shape[:-1], mean.shape[-1]))
     for _ in range(_ITERATIONS):
-        off, H = seen(x)
-        K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
-        new = mean + K @ (off - H @ (mean - x))
-        settled = np.all(np.abs(new - x) <= enough)
+        off, at_x = seen(x)
+        H = np.where(moving[..., None, None], at_x, H)
+        gain = np.linalg.solve(H @ P @ np.swapaxes(H, -1, -2) + R, H @ P)  # S^-1 H P
+        K = np.swapaxes(gain, -1, -2)
+        innovation = off[..., None] - H @ (mean - x)[..., None]
+        new = np.where(moving[..., None], mean + (K @ innovation)[..., 0], x)
+        moving = moving & (np.abs(new - x) > enough).any(axis=-1)
         x = new
-        if settled:
+        if not moving.any():
             break
-    A = np.eye(x.size) - K @ H
-    P = A @ P @ A.T + K @ R @ K.T
-    return Gaussian(x, (P + P.T) / 2)
+    A = np.eye(x.shape[-1]) - K @ H
+    P = A @ P @ np.swapaxes(A, -1, -2) + K @ R @ np.swapaxes(K, -1, -2)
+    return Gaussian(x, (P + np.swapaxes(P, -1, -2)) / 2)
 
 
 def expected(
@@ -301,18 +303,19 @@ def wrapped(difference: np.ndarray, ambiguity: Ambiguity) -> np.ndarray:
     return out
 
 
-def bistatic_distance(length: float, baseline: np.ndarray, direction: np.ndarray) -> float:
-    """Distance from the receiver to a reflector, rho = (L^2 - d^2) / (2 (L - d.u)) [m].
+def bistatic_distance(
+    length: np.ndarray, baseline: np.ndarray, direction: np.ndarray
+) -> np.ndarray:
+    """Distance from the receiver to reflectors (...), rho = (L^2 - d^2) / (2 (L - d.u)) [m].
 
     From |rho u - d| = L - rho; `baseline` d (3,) points from the receiver to the transmitter,
-    `direction` u (3,) unit to the reflector. Not positive where the length is not longer than the
-    baseline.
+    `direction` u (..., 3) unit to each reflector. Not positive where the length is not longer than
+    the baseline.
     """
-    ahead = baseline @ direction
-    return float((length**2 - baseline @ baseline) / (2 * (length - ahead)))
+    ahead = direction @ baseline
+    return np.asarray((length**2 - baseline @ baseline) / (2 * (length - ahead)))
 
 
-@np.errstate(invalid="ignore")  # in the very place of the transmitter
 def birth(
     measurement: np.ndarray,
     std: np.ndarray,
@@ -323,7 +326,30 @@ def birth(
     ambiguity: Ambiguity = UNAMBIGUOUS,
 ) -> Gaussian | None:
     """State after a first detection (4,) with deviations (4,); None where it does not fix a
-    position.
+    position (`births`)."""
+    which, states = births(
+        measurement[None],
+        std[None],
+        own,
+        transmitter,
+        acceleration_std=acceleration_std,
+        ambiguity=ambiguity,
+    )
+    return Gaussian(states.mean[0], states.covariance[0]) if which.size else None
+
+
+@np.errstate(invalid="ignore", divide="ignore")  # in the very place of the transmitter
+def births(
+    measurement: np.ndarray,
+    std: np.ndarray,
+    own: Pose,
+    transmitter: Gaussian | None = None,
+    *,
+    acceleration_std: float,
+    ambiguity: Ambiguity = UNAMBIGUOUS,
+) -> tuple[np.ndarray, Gaussian]:
+    """Which of the detections (Q, 4) with deviations (Q, 4) fix a position, (K,), and the states
+    (K, 9) after each.
 
     Of what the `ambiguity` leaves open the reading counts that is nearest to standing still. The
     position from range and direction (front half-space), its covariance through the inverse
@@ -331,43 +357,39 @@ def birth(
     measured rate: the component along the line of sight (or the bisector) is then known, the others
     are not. The acceleration is zero with `acceleration_std` [m/s^2] per axis.
     """
-    u_x, u_z = measurement[2:]
-    if not np.isfinite(measurement).all() or u_x**2 + u_z**2 >= 1:
-        return None
     there = None if transmitter is None else transmitter.mean
     mean = _resting(measurement, own, there)
-    if mean is None:
-        return None
     off = measurement - measure(mean, own, there)
     read = measurement + (wrapped(off, ambiguity) - off)
     mean = _resting(read, own, there)
-    if mean is None:
-        return None
-    R = measurement_covariance(std, mean, transmitter)
-    J = jacobian(mean, own, there)[_POSITION, :3]
-    rho = float(np.linalg.norm(mean[:3] - own.position))
-    if not np.isfinite(J).all():  # in the very place of the transmitter
-        return None
-    if np.linalg.cond(J * np.array([[1.0], [rho], [rho]])) > 1e6:
-        return None
-    back = np.linalg.inv(J)
-    position = back @ R[np.ix_(_POSITION, _POSITION)] @ back.T
-    if np.trace(position) > BIRTH_POSITION_STD_LIMIT**2:
-        return None
-    P = np.diag([0.0] * 3 + [BIRTH_SPEED_STD**2] * 3 + [acceleration_std**2] * 3)
-    P[:3, :3] = (position + position.T) / 2
-    return _updated(Gaussian(mean, P), read, R, np.array([1]), own, there, UNAMBIGUOUS)
+    J = jacobian(mean, own, there)[:, _POSITION, :3]
+    rho = np.linalg.norm(mean[:, :3] - own.position, axis=1)
+    in_metres = J * np.stack([np.ones_like(rho), rho, rho], axis=1)[..., None]
+    which = np.flatnonzero(np.isfinite(J).all(axis=(1, 2)) & np.isfinite(read).all(axis=1))
+    which = which[np.linalg.cond(in_metres[which]) <= 1e6]
+    mean, read = mean[which], read[which]
+    R = measurement_covariance(std[which], mean, transmitter)
+    back = np.linalg.inv(J[which])
+    position = back @ R[:, _POSITION[:, None], _POSITION] @ np.swapaxes(back, 1, 2)
+    near = np.trace(position, axis1=1, axis2=2) <= BIRTH_POSITION_STD_LIMIT**2
+    which, mean, read, R, position = (a[near] for a in (which, mean, read, R, position))
+    P = np.zeros((len(which), 9, 9))
+    P[:] = np.diag([0.0] * 3 + [BIRTH_SPEED_STD**2] * 3 + [acceleration_std**2] * 3)
+    P[:, :3, :3] = (position + np.swapaxes(position, 1, 2)) / 2
+    rate = np.array([1])
+    return which, _updated(Gaussian(mean, P), read, R, rate, own, there, UNAMBIGUOUS)
 
 
-def _resting(
-    measurement: np.ndarray, own: Pose, transmitter: np.ndarray | None
-) -> np.ndarray | None:
-    """State (9,) of a body at rest where range and direction place it; None: nowhere."""
-    rho, _, u_x, u_z = measurement
-    e = own.to_world(np.array([u_x, np.sqrt(max(1 - u_x**2 - u_z**2, 0.0)), u_z]))
+def _resting(measurement: np.ndarray, own: Pose, transmitter: np.ndarray | None) -> np.ndarray:
+    """States (Q, 9) of targets at rest where range and direction (Q, 4) place them, or NaN."""
+    rho, _, u_x, u_z = measurement.T
+    e = own.to_world(np.stack([u_x, np.sqrt(1 - u_x**2 - u_z**2), u_z], axis=1))
     if transmitter is not None:
         rho = bistatic_distance(rho, transmitter[:3] - own.position, e)
-    return np.concatenate([own.position + rho * e, np.zeros(6)]) if rho > 0 else None
+    out = np.zeros((len(measurement), 9))
+    out[:, :3] = own.position + np.where(rho > 0, rho, np.nan)[:, None] * e
+    out[~(u_x**2 + u_z**2 < 1)] = np.nan
+    return out
 
 
 def costs(

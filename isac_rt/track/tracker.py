@@ -7,7 +7,7 @@ outside, symbols inside: x, P mean and covariance; F, Q, H, R the model.
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from isac_rt.receive.types import Detections, Prediction
 from isac_rt.track.filter import (
     Ambiguity,
     Gaussian,
-    birth,
+    births,
     costs,
     expected,
     measurement_covariance,
@@ -277,28 +277,51 @@ class Tracker(Stateful):
             track.sure += q is not None and bool(detections.starts[q])
             self._live(track, q is not None)
             if q is not None:
-                R = measurement_covariance(detections.std[q], track.state.mean, transmitter)
-                t = None if transmitter is None else transmitter.mean
-                track.state = update(track.state, z[q], R, own, t, ambiguity=self.ambiguity)
                 track.snr, track.detection = float(detections.snr[q]), q
                 track.last = self.state.time
+        self._condition(hit, z, detections.std, own, transmitter)
         self.state.tracks = [t for t in self.tracks if not self._dead(t)]
         if self.settings.births == "unexplained":
             self.state.tracks = united(self.tracks)
-        for q in (q for q in free if detections.starts[q]):
-            state = birth(
-                z[q],
-                detections.std[q],
-                own,
-                transmitter,
-                acceleration_std=self.settings.acceleration_std_mps2,
-                ambiguity=self.ambiguity,
+        free = [q for q in free if detections.starts[q]]
+        which, states = births(
+            z[free],
+            detections.std[free],
+            own,
+            transmitter,
+            acceleration_std=self.settings.acceleration_std_mps2,
+            ambiguity=self.ambiguity,
+        )
+        for i, mean, covariance in zip(which.tolist(), *states, strict=True):
+            q, state = free[i], Gaussian(mean, covariance)
+            track = Track(self.new_id(), state, float(detections.snr[q]), detection=q)
+            track.last = self.state.time
+            track.confirmed = self.settings.confirm_hits == 1
+            self.tracks.append(track)
+
+    def _condition(
+        self,
+        hit: Mapping[int, int],
+        z: np.ndarray,
+        std: np.ndarray,
+        own: Pose,
+        transmitter: Gaussian | None,
+    ) -> None:
+        """Condition tracks on their detections, {number among the tracks: row of z (Q, 4)}: those
+        with and without a direction each at once."""
+        sender = None if transmitter is None else transmitter.mean
+        measured = np.isfinite(z)
+        for kind in {tuple(measured[q].tolist()) for q in hit.values()}:
+            pairs = [(k, q) for k, q in hit.items() if tuple(measured[q].tolist()) == kind]
+            tracks, q = [self.tracks[k] for k, _ in pairs], [q for _, q in pairs]
+            mean, covariance = (
+                np.array(part) for part in zip(*(t.state for t in tracks), strict=True)
             )
-            if state is not None:
-                track = Track(self.new_id(), state, float(detections.snr[q]), detection=q)
-                track.last = self.state.time
-                track.confirmed = self.settings.confirm_hits == 1
-                self.tracks.append(track)
+            R = measurement_covariance(std[q], mean, transmitter)
+            state = Gaussian(mean, covariance)
+            after = update(state, z[q], R, own, sender, ambiguity=self.ambiguity)
+            for track, *of_track in zip(tracks, *after, strict=True):
+                track.state = Gaussian(*of_track)
 
     def snapshot(self, own: Pose, reference: Track | None = None) -> TrackSet:
         """All tracks, tentative ones included, relative to `own`."""
