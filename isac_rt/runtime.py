@@ -60,8 +60,8 @@ SWITCH_S = 2e-4
 that comes out of a kernel waits that long for one that has small things to do, and its core with
 it."""
 FREED_IS_KEPT = {-8: 1, -4: 0, -1: (1 << 31) - 1}
-"""M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's mallopt: memory that one array has left is
-there for the next, in whatever thread, and does not go back to the system, which clears pages
+"""M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's mallopt: memory that one array has left
+is there for the next, in whatever thread, and does not go back to the system, which clears pages
 before it gives them out (7 % of a run's processor time). M_MMAP_THRESHOLD ends at 32 MiB."""
 _NUMBA_CONFIG = ".numba_config.yaml"
 _OF_THE_NAME = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG)

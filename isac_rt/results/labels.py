@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -144,9 +145,7 @@ def explain(
     if aim is None:
         aim = Aim(np.full((len(paths), 2), np.nan), np.ones(2))
     cause, near = np.full(len(detections), -1), np.zeros(len(detections), bool)
-    seen = zip(detections.range, detections.velocity, detections.direction, strict=True)
-    for q, (metres, rate, direction) in enumerate(seen):
-        some = _candidates((metres, rate), direction, places, aim, power, diffuse)
+    for q, some in enumerate(_candidates(detections, places, aim, power, diffuse)):
         best = some.cause()
         if best >= 0:
             cause[q], near[q] = some.path[best], some.near[best]
@@ -202,26 +201,23 @@ class _Candidates(NamedTuple):
 
 
 def _candidates(
-    place: tuple[float, float],
-    direction: np.ndarray,
-    places: Places,
-    aim: Aim,
-    power: np.ndarray,
-    diffuse: np.ndarray,
-) -> _Candidates:
-    """The paths that may have caused a detection at a range and velocity; of the diffuse ones
-    those within a cell."""
-    close = np.abs(place[0] - places.range) <= places.cells[0] * (1 + 1e-9)
-    path = np.flatnonzero(~diffuse | close)
+    detections: Detections, places: Places, aim: Aim, power: np.ndarray, diffuse: np.ndarray
+) -> list[_Candidates]:
+    """List for each detection the paths that may have caused it; of the diffuse ones those within
+    a cell."""
+    close = np.abs(detections.range[:, None] - places.range) <= places.cells[0] * (1 + 1e-9)
+    q, path = np.nonzero(~diffuse | close)
     some = places._replace(range=places.range[path], velocity=places.velocity[path])
-    row, column = some.apart(*place)
+    row, column = some.apart(detections.range[q], detections.velocity[q])
     near, field = (row <= 1) & (column <= 1), diffuse[path]
     share = reach(row) * np.minimum(reach(column) + UNION_FLOOR, 1.0)
-    off = np.abs(aim.direction[path] - direction) / aim.beam
-    return _Candidates(
+    off = np.abs(aim.direction[path] - detections.direction[q]) / aim.beam
+    every = (
         path,
         near,
         np.where(field, 0.0, power[path] * share),
         np.where(field & near, power[path], 0.0),
         np.max(off, axis=1),
     )
+    ends = np.searchsorted(q, np.arange(len(detections) + 1))
+    return [_Candidates(*(a[i:j] for a in every)) for i, j in pairwise(ends)]
