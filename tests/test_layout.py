@@ -234,7 +234,7 @@ MAX_LINES = {
     "propagation": 5000,
     "signal": 1500,
     "receive": 8050,
-    "track": 4900,
+    "track": 4930,
     "access": 1850,
     "scenario": 1630,
     "results": 3450,
