@@ -348,8 +348,8 @@ def births(
     acceleration_std: float,
     ambiguity: Ambiguity = UNAMBIGUOUS,
 ) -> tuple[np.ndarray, Gaussian]:
-    """Which of the detections (Q, 4) with deviations (Q, 4) fix a position, (K,), and the states
-    (K, 9) after each.
+    """Return which of the detections (Q, 4) with deviations (Q, 4) fix a position, (K,), and the
+    states (K, 9) after each.
 
     Of what the `ambiguity` leaves open the reading counts that is nearest to standing still. The
     position from range and direction (front half-space), its covariance through the inverse
