@@ -239,7 +239,7 @@ MAX_LINES = {
     "scenario": 1630,
     "results": 3450,
     "capture": 1900,
-    "simulation": 3440,
+    "simulation": 3500,
     "sweep": 2350,
     "views": 3100,
     "cli": 2100,

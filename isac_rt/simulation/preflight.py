@@ -6,12 +6,14 @@ from __future__ import annotations
 import itertools
 import os
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from isac_rt.document import ScenarioError, ScenarioWarning
 from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.link import Link
 from isac_rt.frame.settings import Noise
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform
@@ -251,6 +253,65 @@ def _closing(own: Pose, other: Pose, antennas: Antennas, passes: int) -> float:
         passes == 2 or antennas.in_view(other.to_body(-line))
     )
     return float((other.velocity - own.velocity) @ line) if seen else 0.0
+
+
+def warn_of_interference(
+    swarm: Swarm,
+    timetable: Timetable,
+    antennas: Antennas,
+    city: CityMesh,
+    budget: tuple[float, Callable[[dict[str, Pose], Link], float]],
+) -> None:
+    """Warn of plain radars whose chirps arrive at each other over the noise of a sample: what is
+    simulated are radars on one clock, whose chirps take turns.
+
+    Looks at the direct paths in `ALIAS_EPOCHS` frames over the run; power by Friis' equation with
+    the patterns of both antennas.
+
+    Parameters
+    ----------
+    city : whose surfaces block direct paths
+    budget : amplitude of one transmit antenna [sqrt(W)], and the noise power of a sample by poses
+        and link [W]
+    """
+    w, (amplitude, noise) = timetable.waveform, budget
+    if w.carries_data:
+        return
+    most = {}  # of each path: power over the noise, power [W], distance [m], frame
+    for frame in np.unique(np.linspace(0, timetable.frames - 1, ALIAS_EPOCHS).round().astype(int)):
+        poses = swarm.poses(timetable.epoch(int(frame)))
+        for tx, rx in itertools.permutations(timetable.with_role("active", int(frame)), 2):
+            power = amplitude**2 * _direct_gain(poses[tx], poses[rx], antennas, w)
+            over = power / noise(poses, Link(rx, rx))
+            if over > max(1.0, most[tx, rx][0] if (tx, rx) in most else 0.0):
+                ends = np.array([poses[tx].position, poses[rx].position])
+                if first_passage(city, _off_the_ends(ends - city.origin)) is None:
+                    most[tx, rx] = over, power, float(np.linalg.norm(ends[1] - ends[0])), frame
+    if not most:
+        return
+    (tx, rx), (over, power, distance, frame) = max(most.items(), key=lambda one: one[1][0])
+    more = f"; {len(most) - 1} more such paths" if len(most) > 1 else ""
+    low, top = w.carrier_frequency / 1e9, (w.carrier_frequency + w.slope * w.chirp_duration) / 1e9
+    share = 100 * min(w.max_delay / w.slot_duration, 1.0)
+    _warn(
+        f"the chirps of {tx} arrive at {rx} with {10 * np.log10(power / 1e-3):.1f} dBm, "
+        f"{10 * np.log10(over):.1f} dB over the noise of a sample ({distance:.4g} m, frame "
+        f"{frame}{more}), both sweep {low:.5g} to {top:.5g} GHz; the run holds for radars on one "
+        f"clock, whose chirps take turns {w.group_spacing * 1e6:.3g} us apart; on clocks of their "
+        f"own they interfere, within the receiver's band at {share:.2g} % of the clock offsets; "
+        "turn or move one of them, or run each alone"
+    )
+
+
+def _direct_gain(tx: Pose, rx: Pose, antennas: Antennas, waveform: Waveform) -> float:
+    """Power that a receiver gets of a direct path over that of one transmit antenna: Friis'
+    equation with the patterns of both elements, times the antennas that send at once."""
+    way = rx.position - tx.position
+    distance = float(np.linalg.norm(way))
+    sent = float(antennas.element_gain(tx.to_body(way / distance)))
+    received = float(antennas.element_gain(rx.to_body(-way / distance)))
+    at_once = waveform.num_tx if waveform.bands > 1 else 1
+    return at_once * sent * received * (waveform.wavelength / (4 * np.pi * distance)) ** 2
 
 
 def warn_of_unseen(seen: Coverage) -> None:

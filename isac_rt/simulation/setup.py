@@ -50,6 +50,7 @@ from isac_rt.simulation.preflight import (
     check_reach,
     check_reference,
     warn_of_aliases,
+    warn_of_interference,
     warn_of_unseen,
 )
 from isac_rt.simulation.stopwatch import NONE, Seconds
@@ -439,6 +440,8 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
         swarm, timetable, antennas, scenario.receivers.velocity_method, scenario.schedule
     )
     free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
+    level = partial(_noise_power, scenario, waveform, free)
+    warn_of_interference(swarm, timetable, antennas, whole, (plan.amplitude, level))
     floor = noise_floor(scenario, plan, free)
     make = _maker(scenario, plan, free, city, floor)
     if store is None or scenario.propagation.model != "ray_traced":
