@@ -730,5 +730,69 @@ OF_TESTS = (
         "test_scoring::test_gospa_is_of_confirmed_tracks_and_uavs_in_view",
         Bug("results/scoring.py", "get(track, [-1, -1, -1])", "get(track, [0, 0, 0])"),
     ),
+    (
+        "test_dataset::test_the_truth_of_a_sample_tells_who_is_shadowed",
+        Bug("sweep/shards.py", "bool(seen.shadowed.values[u])", "bool(seen.in_view.values[u])"),
+    ),
+    (
+        "test_import::test_numbers_that_lost_their_sign_get_it_back",
+        Bug("capture/readers.py", "np.where(values >= 32768,", "np.where(values > 32768,"),
+    ),
+    (
+        "test_over_the_chirp::test_tables_are_decibels_and_degrees",
+        Bug(
+            "hardware/sweep.py",
+            "np.interp(x, np.linspace(-1, 1, len(table)), table)",
+            "np.interp(x, np.linspace(-1, 1, len(table)), table, left=0.0, right=0.0)",
+        ),
+    ),
+    (
+        "test_city::test_triangles_of_a_strip_and_of_a_fan_face_one_way",
+        Bug("world/city/meshfiles.py", "i + 1 + i % 2, i + 2 - i % 2", "i + 1, i + 2"),
+    ),
+    (
+        "test_tables::test_a_city_costs_what_noise_alone_would_find_besides",
+        Bug("views/tables.py", "round(noise_only - hits, 3)", "round(hits - noise_only, 3)"),
+    ),
+    (
+        "test_interchange::test_the_ledger_has_positive_doppler_of_what_comes_nearer",
+        Bug(
+            "views/interchange.py",
+            "lambda p: -carrier_frequency * p.delay_rate",
+            "lambda p: carrier_frequency * p.delay_rate",
+        ),
+    ),
+    (
+        "test_channels::test_draws_scatter_as_stated_and_differ_by_terminal",
+        Bug(
+            "hardware/channels.py",
+            "rng.normal(size=size) * spread",
+            "np.full(size, rng.normal()) * spread",
+        ),
+    ),
+    (
+        "test_receive_data::test_a_frame_read_with_an_honest_prediction_is_not_erased",
+        Bug(
+            "receive/symbols/powers.py",
+            "else min(least, symbols.phase_spread)",
+            "else symbols.phase_spread",
+        ),
+    ),
+    (
+        "test_leakage::test_every_pair_couples_by_a_path_of_its_own",
+        Bug(
+            "receive/joint/leakage.py",
+            "return (1j * phi[..., None])",
+            "return (0j * phi[..., None])",
+        ),
+    ),
+    (
+        "test_interference::test_radars_that_do_not_receive_each_other_are_not",
+        Bug(
+            "simulation/preflight.py",
+            "sent = float(antennas.element_gain(tx.to_body(way / distance)))",
+            "sent = antennas.gain",
+        ),
+    ),
 )
 """(file::name of a test of a hard case, a bug with which it fails) (``--hard``)."""

@@ -113,7 +113,9 @@ def test_numpy_axes_are_those_that_are_named(counts, tmp_path, dtype):
 
 
 def test_numbers_that_lost_their_sign_get_it_back(counts, tmp_path):
-    i, q = counts
+    """The least and the greatest number among them. Planted bug: -32768 left as 32768."""
+    i, q = (values.copy() for values in counts)
+    i[1, 0, 0, :3], q[1, 0, 0, :3] = (-32768, 32767, -1), (32767, -32768, 0)
     np.save(tmp_path / "a.npy", i % 65536 + 1j * (q % 65536))
     found = import_file(tmp_path / "a.npy", Description(wrapped=True, **COMMON))
     assert np.array_equal(found.cube.samples[0], (i + 1j * q)[1].transpose(1, 0, 2))

@@ -40,8 +40,8 @@ def test_gain_and_phase_are_those_stated():
 
 
 def test_draws_scatter_as_stated_and_differ_by_terminal():
-    """400 terminals of 4 elements: 1.8 % of one standard deviation. Planted bug: one draw for all
-    quantities."""
+    """400 terminals of 4 elements: 1.8 % of one standard deviation. Planted bugs: one draw for all
+    quantities; one for all antennas of a terminal."""
     stated = Elements(gain_std_db=1.0, phase_std_deg=3.0, delay_std_ps=5.0)
     drawn = [elements_of(stated, ARRAYS.rx_positions, WAVE, 1, f"U{i}") for i in range(400)]
     gain = np.concatenate([one.gain for one in drawn])
@@ -52,6 +52,8 @@ def test_draws_scatter_as_stated_and_differ_by_terminal():
     assert delay.std() == pytest.approx(5e-12, rel=0.07)
     assert abs(np.corrcoef(db, turn)[0, 1]) < 0.1
     assert abs(np.corrcoef(db, delay)[0, 1]) < 0.1
+    for values in (db, turn, delay):  # of one terminal's antennas against each other
+        assert abs(np.corrcoef(*values.reshape(400, -1)[:, :2].T)[0, 1]) < 0.2
 
 
 def test_coupling_by_level_falls_with_the_square_of_the_distance():

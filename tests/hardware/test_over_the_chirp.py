@@ -11,12 +11,14 @@ from isac_rt.hardware.sweep import READ_ERROR, Ramp, read_at, response_of, short
 
 def test_tables_are_decibels_and_degrees():
     """Straight lines from 2 dB by 0 dB to 1 dB, and from a quarter turn to none and back. Planted
-    bug: places from 0 to 1."""
+    bugs: places from 0 to 1; beyond the swept band nothing, or the other end."""
     one = response_of(Response(table_db=(2, 0, 1), table_deg=(90, 0, 90)), 2, 1, "A")
     found = one.at(np.array([-1.0, 0.0, 0.5, 1.0]))
     truth = 10 ** (np.array([2, 0, 0.5, 1]) / 20) * np.exp(0.5j * np.pi * np.array([1, 0, 0.5, 1]))
     np.testing.assert_allclose(found, [truth, truth], atol=1e-12)
     assert one.common
+    beyond = one.at(np.array([-1.3, -1.01, 1.01, 1.3]))
+    np.testing.assert_allclose(beyond, np.repeat(truth[[0, 3]], 2)[None].repeat(2, axis=0))
 
 
 def test_slopes_differ_by_element():

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_run import fake_run
 from test_sweep import BASE
 
 import isac_rt as irt
@@ -23,7 +24,7 @@ from isac_rt.sweep import Samples, load_dataset
 from isac_rt.sweep.execute import run_job
 from isac_rt.sweep.make_dataset import SceneJob, Shards, _write_card, run_dataset
 from isac_rt.sweep.outcomes import pending
-from isac_rt.sweep.shards import tar_of
+from isac_rt.sweep.shards import _truth, tar_of
 
 SET = """
 name: drawn
@@ -257,6 +258,17 @@ def test_samples_are_those_of_the_run(folder):
         samples[6]
     with pytest.raises(ResultsError, match="there are train, test"):
         Samples(out, "val")
+
+
+def test_the_truth_of_a_sample_tells_who_is_shadowed():
+    """Against the dataset of a run with UAVs in view, out of it and behind walls. Planted bug: in
+    view instead."""
+    d = fake_run().dataset
+    view, shadow = d.in_view.values, d.shadowed.values
+    assert shadow.any() and (shadow != view).any() and (shadow == view).any()
+    for f, o, u in np.ndindex(shadow.shape):
+        told = _truth(d, f, o)["uavs"][str(d.uav.values[u])]
+        assert (told["in_view"], told["shadowed"]) == (view[f, o, u], shadow[f, o, u])
 
 
 def test_a_shard_that_is_not_whole_is_made_anew(folder):

@@ -8,13 +8,15 @@ import json
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from isac_rt.capture.readers import read_sigmf
 from isac_rt.capture.store import cube_dataset, load_cube, save_cube
 from isac_rt.frame.cube import IFCube
+from isac_rt.frame.link import Link
 from isac_rt.frame.settings import Array, Modulation, Noise
 from isac_rt.frame.waveform import Waveform
-from isac_rt.propagation.pathset import PathKind
+from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.propagation.settings import Propagation
 from isac_rt.results.files import ResultsError
 from isac_rt.scenario.radio import Radio
@@ -24,6 +26,7 @@ from isac_rt.simulation import simulate
 from isac_rt.views.interchange import (
     from_sionna,
     stonesoup_detections,
+    write_ledger,
     write_sigmf,
 )
 
@@ -85,6 +88,26 @@ def test_what_is_no_cube_is_said_so(tmp_path):
     (tmp_path / "y.sigmf-meta").write_text(json.dumps({"global": {}}))
     with pytest.raises(ResultsError, match="write_sigmf"):
         read_sigmf(tmp_path / "y")
+
+
+def test_the_ledger_has_positive_doppler_of_what_comes_nearer(tmp_path):
+    """By hand: closing at 12 m/s at 77 GHz is 3.08 kHz. Planted bug: the sign of the rate."""
+    c = 299792458.0
+    paths = make_paths(
+        gain=[1e-3, 1e-4],
+        delay=[80 / c, 90 / c],
+        delay_rate=[-12 / c, 7.5 / c],
+        departure=np.array([[0.0, 1, 0]] * 2),
+        arrival=np.array([[0.0, 1, 0]] * 2),
+        kind=PathKind.TARGET,
+        tx="A",
+        rx="P",
+        epoch=0.1,
+        target_names=("A", "P"),
+    )
+    write_ledger({Link("A", "P"): paths}, tmp_path / "p.nc", 77e9, {})
+    with xr.open_dataset(tmp_path / "p.nc") as found:
+        assert found.doppler.values == pytest.approx([12 / c * 77e9, -7.5 / c * 77e9])
 
 
 @pytest.mark.sionna

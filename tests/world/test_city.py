@@ -22,6 +22,7 @@ from isac_rt.world.city.materials import (
     water_permittivity,
 )
 from isac_rt.world.city.mesh import Surface, clean, distance_to_triangles
+from isac_rt.world.city.meshfiles import _triangles
 from isac_rt.world.city.place import is_lonlat
 from isac_rt.world.city.prism import Finish
 from isac_rt.world.settings import City
@@ -519,6 +520,20 @@ def test_mitsuba_cube_faces_outward(tmp_path):
     assert body.is_watertight
     assert body.volume == pytest.approx(8.0, rel=1e-14)  # rounding
     assert [m.name for m in city.materials] == ["wood"]
+
+
+def test_triangles_of_a_strip_and_of_a_fan_face_one_way():
+    """A strip in zigzag and a fan, both wound counterclockwise as seen from above, by the cross
+    products of their edges. Planted bug: every second triangle of a strip turned over."""
+    strip = np.array([[i, i % 2, 0.1 * i] for i in range(7)])
+    # the first triangle of glTF's strip is v0, v1, v2: here clockwise
+    angle = np.linspace(0, 3, 6)
+    fan = np.vstack([[0, 0, 0], np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)])
+    for corners, mode, count, up in ((strip, 5, 5, -1), (fan, 6, 5, 1)):
+        faces = _triangles(np.arange(len(corners)), mode)
+        a, b, c = (corners[faces[:, k]] for k in range(3))
+        assert len(faces) == count
+        assert (np.sign(np.cross(b - a, c - a)[:, 2]) == up).all()
 
 
 def test_glb_up_axis_transform_scale_and_materials(tmp_path):
