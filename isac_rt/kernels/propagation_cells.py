@@ -16,9 +16,7 @@ FINER = 4.0
 
 @jit
 def leaves(faces, places, boxes, density, most):
-    """Cells of faces, their corners (F, 3, 3), areas and states, that are cut no further: how many,
-    then the row of the face, code, area, state and point, in the order of row and code. Ends early
-    where there are more than `most`."""
+    """`isac_rt.propagation.clutter.cells.leaves`; `boxes` hold the places, `BOX` in each."""
     corners, area, face_states = faces
     room = max(2 * area.size, 1024)
     rows, codes = np.empty(room, np.int64), np.empty(room, np.uint64)
@@ -33,7 +31,7 @@ def leaves(faces, places, boxes, density, most):
         first, last = 0, 1
         while first < last:
             if count + last - first > most:
-                return most + 1, rows, codes, areas, states, points
+                return most + 1, rows[:0], codes[:0], areas[:0], states[:0], points[:0]
             if count == rows.size:
                 rows, codes = np.append(rows, rows), np.append(codes, codes)
                 areas, states = np.append(areas, areas), np.append(states, states)
@@ -48,7 +46,7 @@ def leaves(faces, places, boxes, density, most):
             at = row, face_states[row], count, first, last
             around = line, spans, places, boxes, density, most
             count, first, last = _cut_face(at, leaves, waiting, *around)
-    return count, rows, codes, areas, states, points
+    return count, rows[:count], codes[:count], areas[:count], states[:count], points[:count]
 
 
 @jit(borrows=True)

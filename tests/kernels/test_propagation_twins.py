@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from twins import assert_twins_agree
 
+from isac_rt.kernels.jit import TWINS
+from isac_rt.propagation.clutter import cells
+from isac_rt.propagation.clutter import merging as _merging  # noqa: F401  # has a twin
 from isac_rt.propagation.clutter.field import Rows, Surfaces
 
 
@@ -98,3 +101,138 @@ def test_segments_that_pass_a_disc():
     for spared in (rng.random((count, discs)) < 0.2, rng.random((1, discs)) < 0.3):
         paths = starts, ends, before, total
         assert_twins_agree(name, *paths, places, radii, spared, 0.0039, 3.7, rtol=1e-12)
+
+
+@pytest.mark.sionna
+def test_edges_near_a_path():
+    """Edges strewn over 100 m and paths past them, of many with one near. Planted bug: the foot of
+    the near end weighed by its own distance from the edge."""
+    from isac_rt.propagation.legs.edges import Edges
+
+    rng = np.random.default_rng(10)
+    count = 700
+    start, span = rng.uniform(-50, 50, (count, 3)), rng.uniform(-9, 9, (count, 3))
+    wings = start[:, None] + rng.uniform(-9, 9, (count, 2, 3))
+    middle, half = start + span / 2, np.linalg.norm(span, axis=1) / 2
+    block = np.append(rng.permutation(count), np.full(4, -1)).reshape(-1, 32)
+    centre = middle[block[:, 0]]
+    apart = np.linalg.norm(middle[block] - centre[:, None], axis=2) + half[block]
+    radius = np.where(block < 0, 0.0, apart).max(axis=1)
+    edges = Edges(start, span, wings, middle, half, block, centre, radius)
+    name, found = "isac_rt.propagation.legs.edges.near", []
+    for source, sink in rng.uniform(-40, 40, (20, 2, 3)):
+        for reach in (0.07, 1.3, 30.0):
+            # a detour is a difference of lengths of 100 m
+            assert_twins_agree(name, edges, source, sink, reach, rtol=1e-12, atol=1e-12)
+            found.append(len(TWINS[name][1](edges, source, sink, reach)[0]))
+    assert 0 in found and max(found) == 24 and len(set(found)) > 5
+
+
+@pytest.mark.sionna
+@pytest.mark.parametrize("depth", [1, 3])
+def test_chains_that_reach_a_place(depth):
+    """All chains of up to three of the planes of a city of blocks, to places before and behind its
+    walls. Planted bugs: the mirror crossed from either side; the parent's image left out."""
+    from isac_rt.propagation.legs.chains import Chains
+    from isac_rt.propagation.legs.images import Mirrors
+    from isac_rt.scenario import City
+    from isac_rt.world.city import load_city
+
+    blocks = City(source="blocks", blocks_x=2, blocks_y=2, block_size_m=17.3)
+    city = load_city(blocks, ".", 77e9, np.zeros(3))
+    planes = np.unique(city.plane_of_face)
+    parent, plane, first = [np.full(len(planes), -1)], [planes], [0, len(planes)]
+    for _ in range(depth - 1):
+        each = np.arange(first[-2], first[-1])
+        each = each if len(each) < 100 else each[::7]
+        parent.append(np.repeat(each, len(planes)))
+        plane.append(np.tile(planes, len(each)))
+        first.append(first[-1] + parent[-1].size)
+    chains = Chains(np.concatenate(parent), np.concatenate(plane), np.array(first))
+    ends = np.random.default_rng(11).uniform([-20, -20, 2], [20, 20, 25], (12, 3))
+    name = "isac_rt.propagation.legs.images.reflected"
+    arguments = chains, Mirrors.of(city), depth, np.array([1.3, -2.1, 9.7]), ends
+    assert_twins_agree(name, *arguments, rtol=0)
+    lengths = (TWINS[name][1](*arguments)[:, 1:] >= 0).sum(axis=1)
+    assert {*lengths} == set(range(1, depth + 1)) and len(lengths) > 10
+
+
+def test_cells_of_a_surface():
+    """Faces large and small, near a flight and beyond the reach; and the end where there are too
+    many. Planted bugs: the second of equally long edges halved; a cell's radius left out of its
+    distance."""
+    rng = np.random.default_rng(12)
+    middle = rng.uniform(-60, 60, (40, 1, 3))
+    corners = middle + rng.uniform(-1, 1, (40, 3, 3)) * rng.uniform(1, 30, (40, 1, 1))
+    corners[0] = 8.7 * np.sqrt([[0, 0, 0], [1, 0, 0], [0.25, 0.75, 0]])  # sides alike
+    span = corners[:, 1:] - corners[:, :1]
+    area = np.linalg.norm(np.cross(span[:, 0], span[:, 1]), axis=1) / 2
+    state = rng.integers(0, 2**63, 40).astype(np.uint64)
+    places = np.linspace([-30.3, 5.1, 12.2], [44.1, -3.7, 15.9], 83)
+    arguments = (corners, area, state), places, cells._boxes(places), (0.13, 0.21, 7.3, 55.7)
+    name = "isac_rt.propagation.clutter.cells.leaves"
+    # an area halved is exact, a point is as good as its corners
+    assert_twins_agree(name, *arguments, 100_000, rtol=1e-14)
+    assert TWINS[name][1](*arguments, 100_000)[0] > 1_000
+    assert [f(*arguments, 900)[0] for f in TWINS[name]] == [901, 901]
+
+
+def test_halves_of_cells_that_merge():
+    """Trees of halvings of 30 faces with cells left out, and limits under and over what merges.
+    Planted bugs: the larger of two limits; the half that rings last stands for both."""
+    rng = np.random.default_rng(13)
+    rows = []
+    for face in range(30):
+        waiting = [1]
+        while waiting:
+            code = waiting.pop()
+            if code < 2**9 and rng.random() < 0.8:
+                waiting += [2 * code + 1, 2 * code]
+            elif rng.random() < 0.85:
+                rows.append((face, code))
+    face, code = np.array(rows).T
+    halvings = np.frexp(code.astype(float))[1] - 1
+    area = (7.3 / 2.0**halvings).astype(np.float32)
+    amplitude = (rng.normal(size=(2, len(area))) * [[1], [1j]]).sum(axis=0).astype(np.complex64)
+    clock, limit = rng.exponential(size=len(area)) / area, area * rng.exponential(30, len(area))
+    each = face.astype(np.int32), code.astype(np.uint64), halvings, area, amplitude, clock, limit
+    name = "isac_rt.propagation.clutter.merging.merged"
+    assert_twins_agree(name, *each, rtol=1e-6)  # amplitudes are complex64
+    place, *_ = TWINS[name][1](*each)
+    assert 0.2 * len(area) < len(place) < 0.8 * len(area)
+
+
+@pytest.mark.sionna
+@pytest.mark.parametrize("before", [True, False])
+def test_ways_over_a_mirror_and_a_scatterer(before):
+    """The geometry, then the gains, one way up and down at normal incidence on the mirror. Planted
+    bugs: TE and TM of the mirror exchanged; the direction at the terminal not mirrored."""
+    import isac_rt.propagation.clutter.two_bounces  # noqa: F401  # has the twins
+
+    rng = np.random.default_rng(14)
+    count, faces = 301, 23
+    normals = rng.normal(size=(faces, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    surfaces = Surfaces(
+        normals,
+        rng.integers(0, 3, faces),
+        rng.uniform(0.1, 0.9, (3, 33, 3)),
+        rng.uniform(0.1, 0.4, 3),
+        np.array([-1.0, 0.7, 1.0]),
+        np.array([1.0, 4.0, 9.0]),
+    )
+    points, normal = rng.uniform(-40, 40, (count, 3)), np.array([0.6, 0.64, 0.48])
+    start, end = (rng.normal(size=(3, 3)) * [[30], [12], [3]] for _ in range(2))
+    points[0] = (start[0] if before else end[0]) + 17.3 * normal
+    arrays = [np.zeros(count, dtype) for dtype in (float, float, np.float32, float, float)]
+    cell = np.arange(count, dtype=np.int32)
+    ends = np.zeros((count, 3)), np.zeros((count, 3))
+    rows = Rows(*arrays, *ends, cell, np.zeros(count, np.float32))
+    room = "isac_rt.propagation.clutter.two_bounces"
+    geometry = points, normal, start, end, before, rows
+    assert_twins_agree(f"{room}.lay_out", *geometry, rtol=2e-7)  # accelerations are float32
+    TWINS[f"{room}.lay_out"][1](*geometry)
+    slab = tuple(rng.normal(size=(2, count)) + 1j * rng.normal(size=(2, count)))
+    each = rng.integers(0, faces, count), rng.uniform(0.1, 2, count), rng.uniform(0, 1, count)
+    rest = normal, slab, before, rows, np.zeros(count, complex)
+    assert_twins_agree(f"{room}.weigh", surfaces, *each, 0.37, *rest, rtol=1e-12)

@@ -14,9 +14,11 @@ from collections.abc import Callable
 from dataclasses import astuple, dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from isac_rt.kernels.propagation_cells import BOX, FINER
-from isac_rt.kernels.propagation_cells import leaves as _leaves
+from isac_rt.kernels import propagation_cells
+from isac_rt.kernels.jit import twin_of
+from isac_rt.kernels.propagation_cells import ALIKE, BOX, FINER
 from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import seed_sequence, splitmix64
 from isac_rt.world.city.materials import CityError
@@ -144,7 +146,7 @@ def cut(
     corners = _sorted_corners(city.corners[face])
     order = np.lexsort(corners.reshape(-1, 9).T[::-1])
     face, corners = face[order], corners[order]
-    count, *leaves = _leaves(
+    count, rows, *parts = leaves(
         (corners, city.areas[face], _face_state(corners + city.origin, seed)),
         places,
         _boxes(places),
@@ -157,14 +159,79 @@ def cut(
             "or cell_area_per_metre_m) cuts "
             f"the city into more than {MOST_CELLS} cells; raise it, or lower city.keep_radius_m"
         )
-    rows, *leaves = (part[:count] for part in leaves)
     own = face[rows].astype(np.int32)
     if wanted is not None:
-        some = np.flatnonzero(wanted(leaves[-1], own))
-        own, *leaves = (part[some] for part in (own, *leaves))
-    codes, areas, states, points = leaves
+        some = np.flatnonzero(wanted(parts[-1], own))
+        own, *parts = (part[some] for part in (own, *parts))
+    codes, areas, states, points = parts
     amplitude, clock = _draw(states)
     return Cells(points, areas.astype(np.float32), amplitude, own, codes, clock / areas)
+
+
+@twin_of(propagation_cells.leaves)
+def leaves(
+    faces: tuple[np.ndarray, np.ndarray, np.ndarray],
+    places: np.ndarray,
+    boxes: np.ndarray,
+    density: tuple[float, float, float, float],
+    most: int,
+) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Cut faces, their corners (F, 3, 3), areas (F,) and states (F,), until each cell keeps to a
+    density; none is larger than its distance from the nearest of `places` (K, 3) allows.
+
+    Returns
+    -------
+    number of cells, more than `most` if there would be more; face, code, area, state and point of
+    each, in the order of face and code
+    """
+    per_metre, smallest, near, farthest = density
+    corners, area, state = faces
+    row, code, tree = np.arange(len(area)), np.ones(len(area), np.uint64), cKDTree(places)
+    done = [(row[:0], code[:0], area[:0])]
+    points = [corners[:0]]
+    while row.size:
+        inside = (corners.min(axis=1).max(axis=1) <= farthest) & (
+            corners.max(axis=1).min(axis=1) >= -farthest
+        )
+        row, code, area, corners = (part[inside] for part in (row, code, area, corners))
+        if sum(len(part[0]) for part in done) + len(row) > most:
+            return most + 1, row[:0], code[:0], area[:0], state[:0], corners[:0, 0]
+        middle = corners.mean(axis=1)
+        radius = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+        distance = np.maximum(tree.query(middle)[0] - radius, 0)
+        finer = np.where(FINER * area > smallest, np.minimum(FINER * area / per_metre, near), 0)
+        large = distance < np.maximum(np.where(area > smallest, area / per_metre, 0), finer)
+        done.append((row[~large], code[~large], area[~large]))
+        points.append(corners[~large])
+        row, area = np.repeat(row[large], 2), np.repeat(area[large] / 2, 2)
+        code = (2 * code[large, None] + np.arange(2, dtype=np.uint64)).ravel()
+        corners = _halves(corners[large])
+    row, code, area = (np.concatenate(parts) for parts in zip(*done, strict=True))
+    order = np.lexsort([code, row])
+    row, code, area = row[order], code[order], area[order]
+    own = splitmix64(state[row], code)
+    return len(row), row, code, area, own, _points_in(np.concatenate(points)[order], own)
+
+
+def _halves(corners: np.ndarray) -> np.ndarray:
+    """(2 K, 3, 3) halves of triangles (K, 3, 3), cut from the middle of the longest edge, the first
+    of those equally long."""
+    length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    first = (length >= length.max(axis=1, keepdims=True) * (1 - ALIKE)).argmax(axis=1)
+    turned = np.take_along_axis(corners, ((first[:, None] + np.arange(3)) % 3)[..., None], axis=1)
+    a, b, c = np.moveaxis(turned, 1, 0)
+    middle = (a + b) / 2
+    return np.stack([a, middle, c, middle, b, c], axis=1).reshape(-1, 3, 3)
+
+
+def _points_in(corners: np.ndarray, state: np.ndarray) -> np.ndarray:
+    """(K, 3) points, uniform in triangles (K, 3, 3), hashed from states (K,)."""
+    one, share = (
+        ((splitmix64(state, np.uint64(k)) >> np.uint64(11)).astype(float)[:, None] + 0.5) / 2**53
+        for k in range(2)
+    )
+    a, b, c = np.moveaxis(corners, 1, 0)
+    return a + np.sqrt(one) * (b - a + share * (c - b))
 
 
 def _sorted_corners(corners: np.ndarray) -> np.ndarray:

@@ -144,8 +144,8 @@ def advance(
     cells, and the square root of the mean power gain. `start`, `end` (3, 3): position, velocity,
     acceleration of the ends; `own`: both are one."""
     i = rows.cell
-    n, first = surfaces.normals[face[i]], _motion_to(points[i], start)
-    last = first if own else _motion_to(points[i], end)
+    n, first = surfaces.normals[face[i]], motion_to(points[i], start)
+    last = first if own else motion_to(points[i], end)
     for out, there, back in zip(rows[:3], first, last, strict=False):
         out[:] = there + back
     rows.tx_radius[:], rows.rx_radius[:] = first[0], last[0]
@@ -161,7 +161,7 @@ def advance(
     rows.magnitude[:] = np.where(into * back > 0, gain, 0.0)
 
 
-def _motion_to(points: np.ndarray, body: np.ndarray) -> tuple[np.ndarray, ...]:
+def motion_to(points: np.ndarray, body: np.ndarray) -> tuple[np.ndarray, ...]:
     """Distance (K,) of a moving body (3, 3) from points (K, 3), its rate and acceleration, and the
     unit vectors towards the points."""
     place, velocity, acceleration = body

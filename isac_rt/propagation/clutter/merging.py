@@ -36,7 +36,8 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
-from isac_rt.kernels.propagation_merging import merged as _merged
+from isac_rt.kernels import propagation_merging
+from isac_rt.kernels.jit import twin_of
 from isac_rt.propagation.clutter.cells import Cells
 
 FEWEST = 6
@@ -180,7 +181,7 @@ def merge(cells: Cells, limit: np.ndarray) -> tuple[np.ndarray, Cells]:
     along = cells.code << (62 - halvings).astype(np.uint64)
     order = np.lexsort([along, cells.face])
     some = cells.select(order)
-    found = _merged(
+    found = merged(
         some.face, some.code, halvings[order], some.area, some.amplitude, some.clock, limit[order]
     )
     place, area, amplitude = found
@@ -188,3 +189,52 @@ def merge(cells: Cells, limit: np.ndarray) -> tuple[np.ndarray, Cells]:
     return order[place], replace(
         out, area=area.astype(np.float32), amplitude=amplitude.astype(np.complex64)
     )
+
+
+@twin_of(propagation_merging.merged)
+def merged(
+    face: np.ndarray,
+    code: np.ndarray,
+    halvings: np.ndarray,
+    area: np.ndarray,
+    amplitude: np.ndarray,
+    clock: np.ndarray,
+    limit: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Merge the halves of cells (N,), the finest first, while their area keeps to the least limit.
+
+    The half whose exponential clock of a rate in proportion to its area rings first stands for
+    both; amplitudes add, weighted by the roots of the areas. What does not merge is left, and so is
+    what would merge with it.
+
+    Returns
+    -------
+    place, area, amplitude : (M,) of what is left, as each is known to be left in a walk through the
+        faces: by the last cell of what held it, the finest first
+    """
+    every = np.arange(len(area))
+    nodes = [face, code, every, area.astype(float), limit, np.sqrt(area) * amplitude, every]
+    waiting, left = [part[:0] for part in nodes], []
+    for level in range(halvings.max(initial=0), -1, -1):
+        waiting = [
+            np.append(w, part[halvings == level]) for w, part in zip(waiting, nodes, strict=True)
+        ]
+        order = np.lexsort(waiting[1::-1])
+        faces, name, place, size, most, total, last = (part[order] for part in waiting)
+        half = name >> np.uint64(1)
+        one = np.flatnonzero((faces[1:] == faces[:-1]) & (half[1:] == half[:-1]) & (level > 0))
+        other, least = one + 1, np.minimum(most[one], most[one + 1])
+        both = size[one] + size[other]
+        joins = (place[one] >= 0) & (place[other] >= 0) & (both <= least)
+        apart = np.stack([one, other], axis=1)[~joins].ravel() if level else np.arange(len(name))
+        last[one] = last[other]
+        left.append([part[apart] for part in (last, place, size, total)] + [apart * 0 - level])
+        first = np.where(clock[place[other]] < clock[place[one]], place[other], place[one])
+        place[one], size[one], most[one] = np.where(joins, first, -1), both, least
+        total[one] += total[other]
+        kept = np.setdiff1d(np.arange(len(name)), other)
+        waiting = [part[kept] for part in (faces, half, place, size, most, total, last)]
+    last, place, size, total, level = (np.concatenate(part) for part in zip(*left, strict=True))
+    order = np.lexsort([level, last])
+    order = order[place[order] >= 0]
+    return place[order], size[order], total[order] / np.sqrt(size[order])

@@ -28,15 +28,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.kernels.propagation_two_bounces import lay_out as _lay_out
-from isac_rt.kernels.propagation_two_bounces import weigh as _weigh
-from isac_rt.propagation.clutter.field import ClutterField, Rows, Seen
+from isac_rt.kernels import propagation_two_bounces
+from isac_rt.kernels.jit import twin_of
+from isac_rt.propagation.clutter.field import (
+    ClutterField,
+    Rows,
+    Seen,
+    Surfaces,
+    motion_to,
+    scattered_power,
+)
 from isac_rt.propagation.clutter.mirrors import Mirror, shown, strongest
 from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.reflection import slab_coefficients
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.ways import LinkState
 from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.mirrors import mirror_image
 from isac_rt.world.swarm import Pose
 
 KNOTS_KEPT = 16
@@ -224,14 +232,14 @@ class TwoBounces:
         numbers = (np.empty(count, dtype) for dtype in (float, float, np.float32, float, float))
         ends = np.empty((count, 3)), np.empty((count, 3))
         rows = Rows._make([*numbers, *ends, index, np.empty(count, np.float32)])
-        _lay_out(c.points, mirror.normal, start, end, before, rows)
+        lay_out(c.points, mirror.normal, start, end, before, rows)
         met = rows.departure if before else rows.arrival
         slab = slab_coefficients(
             mirror.material, np.minimum(np.abs(met @ mirror.normal), 1.0), self._wavelength
         )
         gain, scale = np.empty(count, complex), self._wavelength / (4 * np.pi)
         surfaces = self._field.surfaces
-        _weigh(surfaces, c.face, c.area, share, scale, mirror.normal, slab, before, rows, gain)
+        weigh(surfaces, c.face, c.area, share, scale, mirror.normal, slab, before, rows, gain)
         rows.magnitude[:] = size = np.abs(gain)
         some = np.flatnonzero(size > 0)
         turn = (gain[some] / size[some]).astype(np.complex64)
@@ -248,3 +256,86 @@ class TwoBounces:
             bodies.factor(there, self._wavelength, bodies.spared([(state.link.tx,)]))
             * bodies.factor(back, self._wavelength, bodies.spared([(state.link.rx,)]))
         )
+
+
+@twin_of(propagation_two_bounces.lay_out)
+def lay_out(
+    points: np.ndarray,
+    normal: np.ndarray,
+    start: np.ndarray,
+    end: np.ndarray,
+    before: bool,
+    rows: Rows,
+) -> None:
+    """Fill the geometry of rows (K,) of ways over scatterers (N, 3) between two ends (3, 3), their
+    position, velocity and acceleration; one is the image behind a mirror, and its direction is
+    mirrored back to that at the terminal itself."""
+    there, back = (motion_to(points[rows.cell], body) for body in (start, end))
+    for out, one, other in zip(rows[:3], there, back, strict=False):
+        out[:] = one + other
+    rows.tx_radius[:], rows.rx_radius[:] = there[0], back[0]
+    rows.departure[:], rows.arrival[:] = there[3], back[3]
+    turned = rows.departure if before else rows.arrival
+    turned[:] = mirror_image(turned, normal)
+
+
+@twin_of(propagation_two_bounces.weigh)
+def weigh(
+    surfaces: Surfaces,
+    face: np.ndarray,
+    area: np.ndarray,
+    share: np.ndarray,
+    scale: float,
+    normal: np.ndarray,
+    slab: tuple[np.ndarray, np.ndarray],
+    before: bool,
+    rows: Rows,
+    gain: np.ndarray,
+) -> None:
+    """Fill the complex gains (K,) of ways over scatterers; their own amplitudes are left out.
+
+    The mirror passes the part of the vertical field that the receiving end takes as vertical; the
+    field that arrives at a scatterer says which share of its power is TE there.
+    """
+    i, away, home = rows.cell, rows.departure, -rows.arrival
+    n = surfaces.normals[face[i]]
+    u, w = (mirror_image(away, normal), home) if before else (away, mirror_image(home, normal))
+    if before:
+        field = _mirrored(away, u, normal, slab)
+        passed = (field * _vertical(u)).sum(axis=1)
+    else:
+        field = _vertical(u)
+        passed = (_mirrored(w, home, normal, slab) * _vertical(home)).sum(axis=1)
+    into, back = (u * n).sum(axis=1), -(w * n).sum(axis=1)
+    across = np.cross(u, n)
+    whole = (np.abs(field) ** 2).sum(axis=1) * (across**2).sum(axis=1)
+    along = np.abs((field * across).sum(axis=1)) ** 2
+    part = np.where(whole > 1e-24, np.minimum(along / np.maximum(whole, 1e-24), 1.0), 0.5)
+    power = scattered_power(surfaces, face[i], area[i], into, back, -(u * w).sum(axis=1), part)
+    power = np.where(into * back > 0, np.maximum(power, 0.0), 0.0)
+    gain[:] = scale * share * passed * np.sqrt(power) / (rows.tx_radius * rows.rx_radius)
+
+
+def _vertical(u: np.ndarray) -> np.ndarray:
+    """Field (K, 3) of a vertically polarised isotropic element along unit vectors (K, 3): the
+    spherical unit vector theta."""
+    flat = np.hypot(u[:, 0], u[:, 1])
+    ahead = np.where(flat[:, None] > 0, u[:, :2], [1.0, 0.0])
+    ahead = ahead / np.hypot(ahead[:, :1], ahead[:, 1:])
+    return np.column_stack([u[:, 2:] * ahead, -flat])
+
+
+def _mirrored(
+    u: np.ndarray, out: np.ndarray, normal: np.ndarray, slab: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Field (K, 3), complex, along `out` after a mirror, of waves along unit vectors (K, 3) with
+    the vertical field: its TE part and its TM part by the slab's coefficients (K,)."""
+    across = np.cross(u, normal)
+    upright = np.linalg.norm(across, axis=1) < 1e-9  # any direction will do, at normal incidence
+    axis = np.where(np.abs(u[:, :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0])
+    across = np.where(upright[:, None], np.cross(u, axis), across)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    field = _vertical(u)
+    te = slab[0] * (field * across).sum(axis=1)
+    tm = slab[1] * (field * np.cross(across, u)).sum(axis=1)
+    return te[:, None] * across + tm[:, None] * np.cross(across, out)

@@ -16,7 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isac_rt.kernels.propagation_edges import near as _near
+from isac_rt.kernels import propagation_edges
+from isac_rt.kernels.jit import twin_of
+from isac_rt.kernels.propagation_edges import MOST_TRIED
 from isac_rt.propagation.legs.diffraction import LIT_REACH, SHADOW_REACH
 from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.world.city.mesh import CityMesh
@@ -118,7 +120,7 @@ class ShadowEdges:
         nu[~lit] = np.inf
         reach = np.where(lit, LIT_REACH, SHADOW_REACH) ** 2 / 4 * self._wavelength
         edges = self._edges
-        found = [_near(edges, s, e, far) for s, e, far in zip(starts, ends, reach, strict=True)]
+        found = [near(edges, s, e, far) for s, e, far in zip(starts, ends, reach, strict=True)]
         path = np.repeat(np.arange(count), [len(f[0]) for f in found])
         if not path.size:
             return Bends(nu, points)
@@ -139,3 +141,40 @@ class ShadowEdges:
         nu[which] = np.where(lit[which], -size, size)
         points[which] = at[true[first]]
         return Bends(nu, points)
+
+
+@twin_of(propagation_edges.near)
+def near(
+    edges: Edges, source: np.ndarray, sink: np.ndarray, reach: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the silhouette edges near a straight path (3,) to (3,), at most `MOST_TRIED`.
+
+    The shortest way over an edge makes equal angles with it on both sides (Fermat): its point
+    divides the edge between the feet of both ends as their distances from the edge.
+
+    Returns
+    -------
+    detour : (K,) at most `reach`, shortest first [m]
+    point : (K, 3) of the shortest way, on the edge
+    out : (K, 3) unit vectors across the path and the edge, away from what the edge bounds
+    """
+    unit = edges.span / (2 * edges.half[:, None])
+    ahead = (sink - source) / np.linalg.norm(sink - source)
+    foot, off = [], []
+    for end in (source, sink):
+        foot.append(((end - edges.start) * unit).sum(axis=1))
+        off.append(np.linalg.norm(np.cross(end - edges.start, unit), axis=1))
+    apart = off[0] + off[1]
+    at = (foot[0] * off[1] + foot[1] * off[0]) / np.maximum(apart, 1e-9)
+    point = edges.start + np.clip(at, 0, 2 * edges.half)[:, None] * unit
+    way = sum(np.linalg.norm(point - end, axis=1) for end in (source, sink))
+    detour = way - np.linalg.norm(sink - source)
+    normal = np.cross(unit, ahead)
+    size = np.linalg.norm(normal, axis=1)
+    # a silhouette: both faces lie on one side of the plane of the path and the edge
+    side = ((edges.wings - edges.start[:, None]) * normal[:, None]).sum(axis=2)
+    some = (apart >= 1e-9) & (detour <= reach) & (size >= 1e-6) & (side.prod(axis=1) > 0)
+    which = np.flatnonzero(some)
+    which = which[np.argsort(detour[which], kind="stable")][:MOST_TRIED]
+    out = normal[which] / np.where(side[which, :1] < 0, 1, -1) / size[which, None]
+    return detour[which], point[which], out

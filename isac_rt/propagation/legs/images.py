@@ -24,7 +24,9 @@ from typing import NamedTuple
 import numpy as np
 
 from isac_rt.frame.link import Link
-from isac_rt.kernels.propagation_images import WIDER, reflected
+from isac_rt.kernels import propagation_images
+from isac_rt.kernels.jit import twin_of
+from isac_rt.kernels.propagation_images import WIDER
 from isac_rt.propagation.legs.chains import Chains
 from isac_rt.propagation.legs.geometry import (
     LIFT,
@@ -38,6 +40,7 @@ from isac_rt.propagation.legs.legset import LegSet, leg_set
 from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.legs.reflection import mirror_amplitude
 from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.mirrors import mirror_image
 from isac_rt.world.swarm import Pose
 
 ASIDE = np.array([[0.061, -0.047, 0.064], [0.052, 0.073, -0.044]])
@@ -248,3 +251,51 @@ def _lifted(stops: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndar
     side = np.sign(((stops[:, :-2] - stops[:, 1:-1]) * normals).sum(2))
     lift[:, 1:-1] = LIFT * side[..., None] * normals
     return (stops + lift)[:, :-1], (stops + lift)[:, 1:]
+
+
+@twin_of(propagation_images.reflected)
+def reflected(
+    chains: Chains, mirrors: Mirrors, depth: int, start: np.ndarray, ends: np.ndarray
+) -> np.ndarray:
+    """Find the chains that lead from a place (3,) to places (S, 3) by way of faces, whatever stands
+    between: the straight way from the last image must cross each mirror, on a face.
+
+    Returns
+    -------
+    rows : (K, 1 + depth) number of the place, and the faces in order, -1 where a chain is shorter
+    """
+    images = np.empty((len(chains.plane), 3))
+    for level in map(slice, chains.first[:-1], chains.first[1:]):
+        parent, plane = chains.parent[level, None], chains.plane[level]
+        source = np.where(parent < 0, start, images[parent[:, 0]])
+        images[level] = mirror_image(source, mirrors.normals[plane], mirrors.offsets[plane])
+    row, place = np.divmod(np.arange(len(images) * len(ends)), len(ends))
+    point, faces = ends[place], np.full((row.size, depth), -1)
+    for _ in range(depth):  # backwards, from the place to the terminal; row -1: is there
+        on = np.flatnonzero(row >= 0)
+        plane, image = chains.plane[row[on]], images[row[on]]
+        above, behind = (
+            (mirrors.normals[plane] * end).sum(axis=1) - mirrors.offsets[plane]
+            for end in (point[on], image)
+        )
+        crosses = above * behind < 0
+        share = behind / np.where(crosses, behind - above, 1.0)
+        point[on] = image + share[:, None] * (point[on] - image)
+        face = np.where(crosses, _faces_at(mirrors, plane, point[on]), -1)
+        faces[on] = np.column_stack([face, faces[on, :-1]])
+        row[on] = np.where(face >= 0, chains.parent[row[on]], -2)
+    return np.column_stack([place, faces])[row == -1]
+
+
+def _faces_at(mirrors: Mirrors, plane: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(K,) the first faces of planes that hold points (K, 3) of them; -1 where there is none."""
+    out, none = np.full(len(plane), -1), len(mirrors.face)
+    for one in np.unique(plane):
+        on = plane == one
+        at, faces = points[on], slice(*mirrors.first[one : one + 2])
+        flat = np.column_stack([at[:, mirrors.axes[one, :2]], np.ones(len(at))])
+        inside = (np.einsum("fsc,kc->kfs", mirrors.sides[faces], flat) >= -WIDER).all(axis=2)
+        inside &= ((mirrors.low[one] <= at) & (at <= mirrors.high[one])).all(axis=1)[:, None]
+        first = np.where(inside, mirrors.face[faces], none).min(axis=1)
+        out[on] = np.where(first < none, first, -1)
+    return out
