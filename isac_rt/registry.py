@@ -83,7 +83,7 @@ DETECTORS = Registry(
     "detectors",
     {
         "cfar": "isac_rt.receive.chain:cfar_with",
-        "angle_doppler": "isac_rt.receive.clutter.angle_doppler:AngleDoppler",
+        "angle_doppler": "isac_rt.extensions.city_receivers.angle_doppler:AngleDoppler",
     },
 )
 """Functions of the settings `Receivers` and an `Estimator` that return a `Detector`, for active
@@ -92,7 +92,7 @@ PASSIVE_DETECTORS = Registry(
     "passive_detectors",
     {
         "cfar": "isac_rt.receive.chain:cfar_with",
-        "beams": "isac_rt.receive.clutter.bistatic:BeamSearch",
+        "beams": "isac_rt.extensions.city_receivers.bistatic:BeamSearch",
     },
 )
 """The same for passive terminals, whose detector is a `Cfar`."""
@@ -100,7 +100,7 @@ SYMBOL_READERS = Registry(
     "symbol_readers",
     {
         "powers": "isac_rt.receive.symbols.powers:ByPowers",
-        "beams": "isac_rt.receive.symbols.beams:ByBeams",
+        "beams": "isac_rt.extensions.city_receivers.beams:ByBeams",
     },
 )
 """Functions of the DPSK order and of the least run of clutter cells (or None) that return a
@@ -113,6 +113,24 @@ PROPAGATION_MODELS = Registry(
     },
 )
 """Functions of `isac_rt.propagation.build.Ground` that return a `Propagation`."""
+EQUIPMENT = Registry(
+    "equipment", {"city": "isac_rt.extensions.city_receivers.standard:equipment_of"}
+)
+"""Functions of a `Setup`, a `Link` and a set of receivers that return the `Equipment` of the link's
+terminal."""
+MESH_KNOWLEDGE = Registry(
+    "mesh_knowledge",
+    {
+        "walls": "isac_rt.extensions.city_receivers.walls:Walls",
+        "clutter": "isac_rt.extensions.city_receivers.expectation:make_expectation",
+    },
+)
+"""What terminals know of the city's mesh: its walls, and the clutter that they expect."""
+COOPERATIONS = Registry(
+    "cooperations",
+    {name: "isac_rt.extensions.cooperation.swarm:Cooperation" for name in ("tracks", "detections")},
+)
+"""Functions of a `Setup` that return an `isac_rt.simulation.simulate.Exchange`."""
 CITY_SOURCES = Registry(
     "city_sources",
     {

@@ -31,7 +31,7 @@ from isac_rt.propagation.settings import Clutter
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.cfar import CfarRule
-from isac_rt.receive.clutter.filter import remove_standing
+from isac_rt.receive.clutter_filter import remove_standing
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.settings import Receivers

@@ -126,8 +126,8 @@ class Scenes:
     """All places, ready for frames."""
 
     def __init__(self, scene: Scenario) -> None:
+        from isac_rt.extensions.city_receivers.expectation import MeshExpectation
         from isac_rt.propagation.raytrace import RayTracer
-        from isac_rt.track.expectation import MeshExpectation
 
         self.setup: Setup = prepare(scene)
         tracer, expectation = self.setup.propagation, self.setup.expectation

@@ -20,14 +20,14 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy import ndimage
 
+from isac_rt.extensions.city_receivers.angle_doppler import AngleDoppler, noise_level
+from isac_rt.extensions.city_receivers.power import cells_of, expected_power
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload
 from isac_rt.propagation.pathset import PathSet
 from isac_rt.randomness import generator
 from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.chain import filter_of
-from isac_rt.receive.clutter.angle_doppler import AngleDoppler, noise_level
-from isac_rt.receive.clutter.power import cells_of, expected_power
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.settings import Receivers

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from isac_rt.frame.payload import MODULATION_ORDERS
 from isac_rt.randomness import generator
-from isac_rt.receive.clutter.filter import RUN_CELLS
+from isac_rt.receive.clutter_filter import RUN_CELLS
 from reproduce.baselines import LoRadar, loradar_symbol_errors
 from reproduce.fig12 import SNR_DB, clutter_verdict, draw_rate
 from reproduce.montecarlo import (

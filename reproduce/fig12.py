@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from isac_rt.frame.payload import MODULATION_ORDERS
-from isac_rt.receive.clutter.filter import RUN_CELLS
+from isac_rt.receive.clutter_filter import RUN_CELLS
 from isac_rt.receive.symbols.powers import EXTRA_CELLS
 from reproduce.montecarlo import INTERVAL, Curve, Precision, Steps, delay_error_rate
 from reproduce.outcome import (

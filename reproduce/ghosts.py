@@ -3,7 +3,8 @@ finds.
 
 An active terminal, a passive one and another UAV in a canyon whose facades and ground mirror; no
 diffuse clutter. The truth (`det_kind`, `det_order`, `det_face`, `track_uav`) says which tracks are
-ghosts; the test (`isac_rt.track.ghosts`) has the mesh, the terminal's own pose and its tracks.
+ghosts; the test (`isac_rt.extensions.city_receivers.ghosts`) has the mesh, the terminal's own pose
+and its tracks.
 At the passive terminal the line of sight over a wall, which shows the active terminal again, counts
 as a ghost too.
 """
@@ -16,6 +17,8 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from isac_rt.extensions.city_receivers.ghosts import Leeway, Suspicion, suspicion
+from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import antennas_of, resolutions
 from isac_rt.frame.level import transmit_amplitude
 from isac_rt.frame.link import Link
@@ -26,10 +29,8 @@ from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import Setup, prepare
-from isac_rt.track.ghosts import Leeway, Suspicion, suspicion
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
 from isac_rt.track.tracker import TrackSet
-from isac_rt.track.walls import Walls
 from isac_rt.world.swarm import Pose
 from reproduce import SCENES
 from reproduce.outcome import Outcome, Progress, Sentences, Verdict, proportion

@@ -32,7 +32,7 @@ from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import generator
 from isac_rt.receive.cfar import CfarRule
-from isac_rt.receive.clutter.filter import RUN_CELLS, remove_standing
+from isac_rt.receive.clutter_filter import RUN_CELLS, remove_standing
 from isac_rt.receive.estimate import Estimate, LocalSpectra, refine, start_point, to_delay
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps

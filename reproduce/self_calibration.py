@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from isac_rt.extensions.city_receivers.self_calibration import SelfCalibration, Sight
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.randomness import generator
@@ -20,7 +21,6 @@ from isac_rt.receive.modes import MODES
 from isac_rt.receive.types import Look
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
-from isac_rt.track.self_calibration import SelfCalibration, Sight
 from reproduce import SCENES
 from reproduce.outcome import Outcome, Progress, Sentences, Verdict, blank, style, table
 from reproduce.symbols import link_waveform, paper_antennas

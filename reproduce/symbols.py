@@ -27,7 +27,7 @@ from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.pathset import PathKind, merge
 from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import generator
-from isac_rt.receive.clutter.filter import runs
+from isac_rt.receive.clutter_filter import runs
 from isac_rt.receive.symbols.powers import WEAKEST_WEIGHT, decide, decide_transitions, known_cycles
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct

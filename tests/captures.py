@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from isac_rt.extensions.city_receivers.standard import active_terminal, passive_terminal
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload
@@ -21,7 +22,6 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Reception
 from isac_rt.track.settings import Tracking
-from isac_rt.track.standard import active_terminal, passive_terminal
 from isac_rt.track.tracker import TrackSet
 from isac_rt.world.swarm import Pose
 

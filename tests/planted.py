@@ -394,7 +394,7 @@ OF_CASES = {
     ),
     "processing gain": Bug("frame/level.py", "- 2 * 10 * np.log10(1.5)", "- 10 * np.log10(1.5)"),
     "standing clutter is removed": Bug(
-        "receive/clutter/filter.py", "sent = schedule[m] == tx", "sent = schedule[m] >= tx"
+        "receive/clutter_filter.py", "sent = schedule[m] == tx", "sent = schedule[m] >= tx"
     ),
     "rayleigh clutter": Bug(
         "propagation/clutter/rayleigh.py",
@@ -423,8 +423,8 @@ OF_CASES = {
     ),
     "consistency of innovations": Bug(
         "track/filter.py",
-        "P = A @ P @ A.T + K @ R @ K.T",
-        "P = A @ P @ A.T / 4",
+        "P = A @ P @ np.swapaxes(A, -1, -2) + K @ R @ np.swapaxes(K, -1, -2)",
+        "P = A @ P @ np.swapaxes(A, -1, -2) / 4",
     ),
     "consistency in manoeuvres": Bug(
         "track/filter.py",
@@ -651,7 +651,7 @@ OF_TESTS = (
     (
         "test_ghost_images::test_reflections_are_the_images_that_each_end_sees",
         Bug(
-            "track/ghosts.py",
+            "extensions/city_receivers/ghosts.py",
             "*_images(body, start, walls, reach)",
             "*_images(body, here, walls, reach)",
         ),

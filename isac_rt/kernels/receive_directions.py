@@ -240,7 +240,7 @@ def _within(heard, count, begin, lines, total, step, other):
 
 @jit(fast=True)
 def covariances(cells, scatterers, tables, shape, out):
-    """`isac_rt.receive.clutter.covariance.fill_covariances`, `TOGETHER` scatterers at a time."""
+    """`covariance.fill_covariances` of the city receivers, `TOGETHER` scatterers at a time."""
     rows, bins, num_bins = cells
     start, beat, doppler, power, steer = scatterers
     size = steer.shape[1]

@@ -15,8 +15,8 @@ LEAST_RANGE = 1.0
 
 @jit
 def met(start, end, normals, offsets, low, high, first, last, reach):
-    """`isac_rt.track.images.met`: planes that cannot make a path of a length that counts are left
-    out before any point is found."""
+    """`images.met` of the city receivers: planes that cannot make a path of a length that counts
+    are left out before any point is found."""
     pairs, places, count = np.empty((64, 2), np.int64), np.empty((64, 3, 3)), 0
     once, at_j, A, B = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     before = np.array([_dot(normals[j], end) - offsets[j] for j in last])

@@ -9,7 +9,7 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.schedule import codes_of
 from isac_rt.receive.chain import Refiner, detector_of, filter_of, refiner_of
-from isac_rt.receive.clutter.filter import ClutterFilter
+from isac_rt.receive.clutter_filter import ClutterFilter
 from isac_rt.receive.joint.leakage import without_leakage
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.known import Known

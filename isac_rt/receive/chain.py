@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from isac_rt.receive.clutter.filter import RUN_CELLS, ClutterFilter
+from isac_rt.receive.clutter_filter import RUN_CELLS, ClutterFilter
 from isac_rt.receive.estimate import Estimator
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.joint.neighbours import refine_jointly

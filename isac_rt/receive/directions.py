@@ -6,7 +6,7 @@ direction,
 .. math:: T(u) = \sum_t |a^H R^{-1} x_t|^2 / (a^H R^{-1} a),
 
 R their covariance under noise and clutter, in units of the noise (see
-`isac_rt.receive.clutter.adaptive`). An echo has one look, all virtual channels; at a passive
+`adaptive` of the city receivers). An echo has one look, all virtual channels; at a passive
 terminal the transmit antennas are the looks, for nobody knows the direction in which they sent.
 Where there is noise alone R = 1, and a bound on the sum over the lines of the array spares most
 cells the search.

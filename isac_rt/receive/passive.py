@@ -19,7 +19,6 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Cfar, Sensed, describe, look_at, make_maps
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import cleaned
-from isac_rt.receive.symbols.blind import Peaks, find_peaks, read_peaks
 from isac_rt.receive.symbols.phases import decide_phases
 from isac_rt.receive.symbols.powers import (
     ByPowers,
@@ -165,17 +164,12 @@ class PassiveReceiver:
         reception = self._reception(cube, moments, found, detections, reference, maps=maps)
         return _decoded(reception, symbols)
 
-    def peaks(self, cube: IFCube, time: float, modulated: bool) -> Peaks:
-        """Return the peaks kept of a frame that could not be read, `time` its middle [s]."""
-        mine = cube if self.groups is None else cube.of_groups(self.groups)
-        return find_peaks(mine, time, modulated)
-
-    def read_kept(self, peaks: Peaks, path: Prediction, waveform: Waveform) -> Reception | None:
-        """A frame read in retrospect; None where it does not show the path."""
-        symbols = read_peaks(peaks, path, self.antennas, self.reader.order)
-        if symbols is None or not self._believed(symbols, peaks.waveform):
+    def of_symbols(self, symbols: Symbols, read: Waveform, waveform: Waveform) -> Reception | None:
+        """Return the reception of symbols that were read by a waveform of this receiver's groups;
+        None where they are not believed."""
+        if not self._believed(symbols, read):
             return None
-        out = _decoded(Reception.undecoded(peaks.waveform, no_detections()), symbols)
+        out = _decoded(Reception.undecoded(read, no_detections()), symbols)
         return out if self.groups is None else _among_all(out, self.groups, waveform)
 
     def _phases(self, moments: Moments, detections: Detections) -> np.ndarray | None:

@@ -21,7 +21,7 @@ from isac_rt.results.dataset import Columns
 from isac_rt.results.metrics import GOSPA_CUTOFF_M
 from isac_rt.results.records import ObserverRecord, PictureRecord
 from isac_rt.results.sensing import gospa_block
-from isac_rt.track.fusion import Fused, Key
+from isac_rt.track.fused import Fused, Key
 from isac_rt.world.swarm import Pose
 
 SWARM = "swarm"

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,6 +36,7 @@ from isac_rt.propagation.pathset import PathSet
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
+from isac_rt.registry import MESH_KNOWLEDGE
 from isac_rt.results.provenance import path_content
 from isac_rt.results.records import Use
 from isac_rt.scenario.tree import Scenario
@@ -54,9 +56,8 @@ from isac_rt.simulation.preflight import (
     warn_of_unseen,
 )
 from isac_rt.simulation.stopwatch import NONE, Seconds
-from isac_rt.track.expectation import ClutterExpectation, Mistakes, make_expectation
+from isac_rt.track.expectation import ClutterExpectation, Mistakes
 from isac_rt.track.settings import Belief
-from isac_rt.track.walls import Walls
 from isac_rt.world.area import city_about, city_digest
 from isac_rt.world.city import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
@@ -268,9 +269,10 @@ class Setup:
         return ideal(self.calibration, cube)
 
     @cached_property
-    def walls(self) -> Walls:
-        """The city as terminals hold births and tracks against it."""
-        return Walls(self.city.without(self.scenario.belief.missing_m))
+    def walls(self) -> Any:
+        """The city as terminals hold births and tracks against it
+        (`isac_rt.extensions.city_receivers.walls.Walls`)."""
+        return MESH_KNOWLEDGE.load("walls")(self.city.without(self.scenario.belief.missing_m))
 
     def believed(self, pose: Pose) -> Pose:
         """Return the pose that a terminal believes to have."""
@@ -488,7 +490,9 @@ def _expectation_of(
     about = scenario.clutter, plan.swarm, believed, plan.waveform
     own = [link for link in plan.timetable.all_links if link.own]
     floor = _floor_of(scenario, plan, free, own)
-    return make_expectation(*about, plan.antennas, scenario.seed, floor)
+    make = MESH_KNOWLEDGE.load("clutter")
+    found: ClutterExpectation = make(*about, plan.antennas, scenario.seed, floor)
+    return found
 
 
 def _noise_power(

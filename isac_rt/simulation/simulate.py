@@ -11,7 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from threadpoolctl import threadpool_limits
 
@@ -21,27 +21,30 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
 from isac_rt.plain import plain, restored
 from isac_rt.receive.settings import Receivers
+from isac_rt.registry import COOPERATIONS, EQUIPMENT
+from isac_rt.results.metrics import SymbolCount
 from isac_rt.results.provenance import provenance
 from isac_rt.results.recorder import Figures, Recorder, Results
 from isac_rt.results.records import FrameRecord, LateRecord, ObserverRecord, PictureRecord
 from isac_rt.results.scoring import Heard, Scorer
-from isac_rt.results.swarm import SwarmScorer
+from isac_rt.results.swarm import SwarmScorer, View
 from isac_rt.runtime import tracing_in_one_thread
 from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.scenario.tree import OWN, Scenario
-from isac_rt.simulation.cooperation import AHEAD, Cooperation
 from isac_rt.simulation.plan import decisions, extent, mechanisms
 from isac_rt.simulation.preflight import receivers_at_work
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
 from isac_rt.simulation.stopwatch import Stopwatch
-from isac_rt.track.parts import KnownBody, Late
+from isac_rt.track.parts import Equipment, KnownBody, Late
 from isac_rt.track.reference import TerminalState
-from isac_rt.track.standard import Surroundings, active_terminal, passive_terminal
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal, Receiver
 from isac_rt.world.swarm import Pose
 
 _LOG = logging.getLogger(__name__)
+PREFETCHED_FRAMES = 2
+"""Frames at work at once: a frame does not wait for the slowest link of the one before, and its
+receivers know what was reported to them until this many frames before it."""
 Progress = Callable[[int, int], None]
 Terminal = ActiveTerminal | PassiveTerminal
 Jobs = dict[Link, Future[list[Heard]]]
@@ -59,22 +62,23 @@ def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = N
     ['ActiveTerminal', 'PassiveTerminal', 'PassiveTerminal']
     """
     s = settings or setup.scenario
-    walls = setup.walls if s.tracking.needs_mesh else None
+    equipment = EQUIPMENT.load("city")(setup, link, s) if _knows_city(s) else Equipment()
+    known = setup.waveform, setup.antennas, s.receivers, s.tracking
     if link.own:
-        return active_terminal(setup.waveform, setup.antennas, s.receivers, s.tracking, walls)
-    clutter = None
-    if s.receivers.passive_detector == "beams" and setup.expectation is not None:
-        known = link, setup.plan.amplitude
-        clutter = partial(setup.expectation.between, *known, mistakes=setup.mistakes)
-    return passive_terminal(
-        setup.waveform,
-        setup.antennas,
-        s.receivers,
-        s.tracking,
-        setup.scenario.modulation.dpsk_order,
-        setup.plan.amplitude,
-        groups=setup.timetable.groups(link),
-        surroundings=Surroundings(walls, clutter),
+        return ActiveTerminal(*known, equipment)
+    order, groups = setup.scenario.modulation.dpsk_order, setup.timetable.groups(link)
+    return PassiveTerminal(*known, order, setup.plan.amplitude, groups, equipment)
+
+
+def _knows_city(s: ReceiverSet | Scenario) -> bool:
+    """Return whether terminals have more than a receiver and a tracker."""
+    r = s.receivers
+    return (
+        s.tracking.births == "unexplained"
+        or r.link_acquisition == "blind"
+        or r.self_calibration != "none"
+        or r.passive_detector == "beams"
+        or r.gate_false_alarm_rate is not None
     )
 
 
@@ -203,12 +207,40 @@ class _Observer:
         return self.scorer.record(frame.number, paths, sent, heard, frame.noise_power(self.link))
 
 
+class Exchange(Protocol):
+    """Exchange of reports between the terminals of one set of receivers."""
+
+    def step(
+        self,
+        frame: int,
+        heard: Mapping[Link, Heard],
+        symbols: Mapping[Link, SymbolCount],
+        late: Mapping[Link, Sequence[LateRecord]],
+    ) -> dict[str, View]:
+        """Return the fused tracks after a frame, by terminal and of all together (`SWARM`)."""
+        ...
+
+    def told(self, link: Link, frame: int, time: float) -> list[KnownBody]:
+        """Return the targets that a link's receiver knew of after a frame, at a time [s]."""
+        ...
+
+    def memory(self) -> dict[str, Any]:
+        """Return the state carried over to the next frame, for `restore`."""
+        ...
+
+    def restore(self, memory: Mapping[str, Any]) -> None:
+        """Go on from a `memory`."""
+        ...
+
+
 class _Swarm:
     """Exchange between the terminals of a set of receivers, with its score."""
 
     def __init__(self, setup: Setup) -> None:
         self._swarm = setup.swarm
-        self._cooperation, self._scorer = Cooperation(setup), SwarmScorer(setup.timetable)
+        make = COOPERATIONS.load(setup.scenario.cooperation)
+        self._cooperation: Exchange = make(setup)
+        self._scorer = SwarmScorer(setup.timetable)
 
     def step(
         self,
@@ -264,10 +296,10 @@ class _Listeners:
         )
 
     def told(self, link: Link, frame: int) -> list[KnownBody]:
-        """Return what the link's receiver knows from others in a frame: what it knew `AHEAD` frames
-        before, so that no frame waits for the one before."""
+        """Return what the link's receiver knows from others in a frame: what it knew
+        `PREFETCHED_FRAMES` frames before, so that no frame waits for the one before."""
         when = self.recorder.timetable.epoch(frame, link.tx)
-        return self.swarm.told(link, frame - AHEAD, when) if self.swarm else []
+        return self.swarm.told(link, frame - PREFETCHED_FRAMES, when) if self.swarm else []
 
     def record(self, frame: Frame, heard: Mapping[Link, Heard], snapshot: bool) -> None:
         """Hold a frame against the truth."""
@@ -477,7 +509,7 @@ class _Run:
             for number in range(self.restore(resume) if resume else 0, frames):
                 with self.stopwatch.stage("trace"):
                     frame = setup.frame(number)
-                settle(0 if dependent else AHEAD - 1)
+                settle(0 if dependent else PREFETCHED_FRAMES - 1)
                 frame = frame.sent_by({name: self.schedules.of(name) for name in frame.sent})
                 jobs = {}
                 for link in setup.timetable.links(number):

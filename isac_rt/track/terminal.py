@@ -85,7 +85,7 @@ class ActiveTerminal(Stateful):
     Parameters
     ----------
     waveform, antennas, receivers, tracking : with `tracking.births` unexplained the rules are those
-        of `isac_rt.track.standard`, which needs a city
+        of `isac_rt.extensions.city_receivers.standard`, which needs a city
     equipment : rules for its tracks, and what else it has
 
     Examples

@@ -7,6 +7,7 @@ import pytest
 from receiver_cubes import ANTENNAS
 from twins import assert_twins_agree
 
+from isac_rt.extensions.city_receivers import covariance
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import Waveform
@@ -16,7 +17,6 @@ from isac_rt.kernels.receive_estimate import Chirps, WindowAxis
 from isac_rt.kernels.receive_maps import ROWS
 from isac_rt.kernels.vector import LANES, PART, aligned
 from isac_rt.receive import cfar, directions, estimate, maps, omp, pursuit, spectrum, transform
-from isac_rt.receive.clutter import covariance
 from isac_rt.receive.joint import moments
 from isac_rt.receive.joint.tones import JointPath, Tones, powers_of_time
 from isac_rt.receive.known import Known
@@ -135,7 +135,9 @@ def test_covariances_of_clutter():
     scatterers = start, *offsets, power[order], steer
     out = np.zeros((4, size, size), np.complex64)
     args = cells, scatterers, tables, taper.astype(np.float32), out
-    assert_twins_agree("isac_rt.receive.clutter.covariance.fill_covariances", *args, rtol=SINGLE)
+    assert_twins_agree(
+        "isac_rt.extensions.city_receivers.covariance.fill_covariances", *args, rtol=SINGLE
+    )
 
 
 @pytest.mark.parametrize("fine", [False, True])

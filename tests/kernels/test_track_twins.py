@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from twins import assert_twins_agree
 
+from isac_rt.extensions.city_receivers import images
 from isac_rt.kernels.jit import TWINS
-from isac_rt.track import images
 
 MET = f"{images.__name__}.met"
 

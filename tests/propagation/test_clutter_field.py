@@ -16,6 +16,8 @@ from scipy import stats
 from scipy.integrate import dblquad
 
 from isac_rt import randomness, scenario
+from isac_rt.extensions.city_receivers.covariance import Bucketed
+from isac_rt.extensions.city_receivers.power import TAPER, Taper, expected_power
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import conventional_schedule
@@ -24,8 +26,6 @@ from isac_rt.propagation.clutter import cells as clutter_cells
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.ways import LinkState
-from isac_rt.receive.clutter.covariance import Bucketed
-from isac_rt.receive.clutter.power import TAPER, Taper, expected_power
 from isac_rt.receive.directions import searches
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import ExpectedClutter
@@ -492,7 +492,7 @@ def expectation(
     city: CityMesh, speed=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0), pattern="isotropic", gain_dbi=0.0
 ):
     """A terminal's own copy of the mesh and its pose."""
-    from isac_rt.track.expectation import make_expectation
+    from isac_rt.extensions.city_receivers.expectation import make_expectation
 
     tree = {
         "frames": 40,

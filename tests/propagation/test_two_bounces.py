@@ -28,13 +28,14 @@ from test_clutter_field import (
 from truths.clutter import sionna_power
 
 from isac_rt import scenario
+from isac_rt.extensions.city_receivers.expectation import make_expectation
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator
 from isac_rt.simulation.setup import propagation_in, swarm_of
-from isac_rt.track.expectation import Mistakes, make_expectation
+from isac_rt.track.expectation import Mistakes
 from isac_rt.world.city import CityMesh, Material, load_city
 from isac_rt.world.swarm import Pose
 

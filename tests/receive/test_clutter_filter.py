@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.active import receive_active
-from isac_rt.receive.clutter.filter import occupied_factor, remove_standing, runs
+from isac_rt.receive.clutter_filter import occupied_factor, remove_standing, runs
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import demodulate

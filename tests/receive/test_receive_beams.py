@@ -10,12 +10,12 @@ import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
 from scipy import special, stats
 
+from isac_rt.extensions.city_receivers.beams import _likelihood, demodulate_beams
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import gray_bits
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.symbols.beams import _likelihood, demodulate_beams
 from isac_rt.receive.symbols.powers import demodulate
 from isac_rt.receive.types import Prediction
 

@@ -13,7 +13,7 @@ import pytest
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import MODULATION_ORDERS, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
-from isac_rt.receive.clutter.filter import chirp_runs
+from isac_rt.receive.clutter_filter import chirp_runs
 from isac_rt.receive.symbols.powers import demodulate
 from isac_rt.receive.types import Prediction
 from isac_rt.results.metrics import binomial_interval

@@ -17,7 +17,7 @@ from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import timetable_of
 from isac_rt.track.filter import Gaussian
-from isac_rt.track.fusion import Fused, Key, Name
+from isac_rt.track.fused import Fused, Key, Name
 from isac_rt.world.swarm import Pose
 
 PLACES = {

@@ -9,10 +9,10 @@ import pytest
 from talking import scenario
 
 from isac_rt.document import ScenarioError
+from isac_rt.extensions.city_receivers import standing
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare
-from isac_rt.track import standing
 from isac_rt.track.settings import Belief
 
 SCENES = Path(__file__).parents[2] / "scenes"

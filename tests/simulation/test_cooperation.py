@@ -8,6 +8,7 @@ from talking import scenario
 from test_resume import Stopped, assert_equal_results, stopping_at
 
 from isac_rt.access.settings import Access
+from isac_rt.extensions.cooperation.swarm import look_of
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
@@ -18,7 +19,6 @@ from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM
 from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.simulation import simulate
-from isac_rt.simulation.cooperation import look_of
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.simulate import standard_terminal
 from isac_rt.track.filter import Gaussian, measure

@@ -15,12 +15,12 @@ from captures import Step, flat, save_capture
 from threadpoolctl import threadpool_limits
 
 from isac_rt import runtime
+from isac_rt.extensions.city_receivers.standard import passive_terminal
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.results.files import open_results, save
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare
-from isac_rt.track.standard import passive_terminal
 
 SCENES = Path(__file__).parents[2] / "scenes"
 FRAMES = {"frames": 6}

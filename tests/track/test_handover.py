@@ -12,6 +12,7 @@ import pytest
 from oracles import slopes, what_is_measured
 from receiver_cubes import ANTENNAS
 
+from isac_rt.extensions.city_receivers.standard import active_terminal, passive_terminal
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
@@ -19,7 +20,6 @@ from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Recep
 from isac_rt.track.filter import Gaussian
 from isac_rt.track.reference import Followed, TerminalState, slip_cells
 from isac_rt.track.settings import Tracking
-from isac_rt.track.standard import active_terminal, passive_terminal
 from isac_rt.track.terminal import PassiveTerminal
 from isac_rt.track.tracker import Track
 from isac_rt.world.swarm import Pose

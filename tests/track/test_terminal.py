@@ -13,6 +13,11 @@ import pytest
 from captures import Step, flat, save_capture
 from receiver_cubes import ANTENNAS, Path, cube
 
+from isac_rt.extensions.city_receivers.standard import (
+    active_terminal,
+    expected_targets,
+    passive_terminal,
+)
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
@@ -21,7 +26,6 @@ from isac_rt.track.filter import Gaussian
 from isac_rt.track.parts import KnownBody, Own, of_itself
 from isac_rt.track.reference import TerminalState
 from isac_rt.track.settings import Tracking
-from isac_rt.track.standard import active_terminal, expected_targets, passive_terminal
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
 from isac_rt.track.tracker import Track
 from isac_rt.world.swarm import Pose, attitude

@@ -19,7 +19,7 @@ from isac_rt.propagation.settings import Clutter
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.arms import arm
 from isac_rt.receive.cfar import CfarRule, greatest_of_factor
-from isac_rt.receive.clutter.filter import remove_standing
+from isac_rt.receive.clutter_filter import remove_standing
 from isac_rt.receive.estimate import direction_cosine
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps, slow_window, union_operator

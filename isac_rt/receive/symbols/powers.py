@@ -19,7 +19,7 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import by_antenna, demodulate_bits, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.vector import new_memory
-from isac_rt.receive.clutter.filter import runs
+from isac_rt.receive.clutter_filter import runs
 from isac_rt.receive.spectrum import tones
 from isac_rt.receive.transform import transform
 from isac_rt.receive.types import Prediction
@@ -95,7 +95,7 @@ def demodulate(
     prediction : row 0 is the reference path; further rows vote with their predicted power
     dpsk_order : D
     run_cells : leave runs of so many occupied cells out of the decision
-        (`isac_rt.receive.clutter.filter`); None: do not look
+        (`isac_rt.receive.clutter_filter`); None: do not look
     """
     w = cube.waveform
     delays, rates = prediction.range / SPEED_OF_LIGHT, prediction.velocity / SPEED_OF_LIGHT

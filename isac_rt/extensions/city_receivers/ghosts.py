@@ -1,0 +1,310 @@
+"""Ghost tracks by geometry: the terminal knows its own pose and the city's mesh, and nothing of the
+truth.
+
+A wall shows each UAV again, as a mirror does. Two questions are asked of a track, and either is
+enough to make it suspect:
+
+- Is it one of the echoes that a nearer body must have over walls? There (straight) and back (over
+  a wall), the reverse, or over a wall on both ways: their ranges, rates and directions follow from
+  the source's state and the wall's plane. An echo over a wall is always longer than the direct one,
+  and so weaker; being farther stands here for being weaker. The body is another track, or one that
+  the terminal was told of: a UAV that the line of sight masks is heard by its echoes over walls.
+- Does it lie behind a surface of the mesh? No UAV there could be seen straight.
+
+A passive terminal asks the same of its reflectors, whose echoes come from its reference, the active
+terminal, as it tracks it; and whether one is that terminal itself over a wall.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from isac_rt.extensions.city_receivers.walls import Walls, lengths
+from isac_rt.frame.antennas import Antennas, resolutions
+from isac_rt.frame.waveform import Waveform
+from isac_rt.track.filter import Ambiguity, measure, wrapped
+from isac_rt.track.parts import Own, TrackRule
+from isac_rt.track.tracker import Track, Tracker, TrackSet, track_set
+from isac_rt.world.swarm import Pose
+
+DEVIATIONS = 3.0
+"""How many standard deviations a track may be off."""
+MEETING = 1e-9
+"""How far off its faces a wave may meet a mirror, for rounding [m]."""
+RESOLUTION_SHARE = 0.5
+"""Share of the resolution that it may be off besides: echoes that share a cell pull each other's
+estimates."""
+ECHOED_FRAMES = 3
+"""So many frames in a row a confirmed track fits a nearer body's echo, or lies behind a wall,
+before it ends: the body may be known only after its echo was confirmed, the place only then well
+enough, and a UAV may cross the place of another one's echo."""
+CROSSING_M = 3.0
+"""Confirmed tracks are held against the walls so near to them [m]: one that lay before all walls
+comes by here on its way behind one."""
+ONE_WAY_SHARE = 2.0
+"""The same for the direction of an echo over a wall on one way at an active terminal: its transmit
+antennas see another direction than its receive antennas, so that the halves of the virtual array do
+not join, and the receive antennas' resolution is twice as wide."""
+
+
+@dataclass
+class Echoed:
+    """Frames in a row in which a track fits a nearer target's echo over a wall, or lies behind one,
+    by its number."""
+
+    frames: dict[int, int] = field(default_factory=dict)
+
+
+class Ghosts(TrackRule):
+    """No track is confirmed, or kept for long, that walls explain.
+
+    Parameters
+    ----------
+    walls : the mesh
+    leeway : what detections leave open
+    """
+
+    def __init__(self, walls: Walls, leeway: Leeway) -> None:
+        self._walls, self._leeway = walls, leeway
+        self.state = Echoed()
+
+    def prune(self, tracker: Tracker, own: Own) -> None:
+        """End the tracks, among those to be confirmed, that a wall explains, and of the others
+        those that are a nearer target's echoes over a wall frame after frame, or that went behind
+        one. Targets that others report have such echoes too."""
+        confirmed = {t.id for t in tracker.tracks if t.confirmed}
+        if not confirmed:
+            return
+        tracks = tracker.snapshot(own.pose, own.reference)
+        new = confirmed & own.tentative
+        crossing = {
+            t.id
+            for t in tracker.tracks
+            if t.id in confirmed - new and self._walls.within(t.state.mean[:3], CROSSING_M)
+        }
+        asked = np.isin(tracks.ids, [*(new | crossing)]) & ~tracks.is_reference
+        reports = [Track.of_body(body.state) for body in own.reports]
+        others = track_set(reports, own.pose, own.reference)
+        said = suspicion(tracks, own.pose, self._walls, self._leeway, others, asked)
+        suspect = set(tracks.ids[said.suspect].tolist())
+        before = self.state.frames
+        self.state.frames = {k: before.get(k, 0) + 1 for k in sorted(suspect)}
+        echoes = {k for k, frames in self.state.frames.items() if frames >= ECHOED_FRAMES}
+        tracker.drop(echoes | (suspect & new))
+
+
+@dataclass(frozen=True)
+class Leeway:
+    """Uncertainty of a path that a detection leaves.
+
+    Attributes
+    ----------
+    resolution : (4,) range [m], velocity [m/s], u_x, u_z, of `frame.antennas.resolutions`; of one
+        pass at a passive terminal
+    ambiguity : of range and velocity
+    turn : of `Antennas`: an image may stand beyond the view
+    """
+
+    resolution: np.ndarray
+    ambiguity: Ambiguity
+    turn: float = np.inf
+
+    @classmethod
+    def of(cls, waveform: Waveform, antennas: Antennas, passes: int) -> Leeway:
+        """At an active terminal (2 passes) or a passive one (1)."""
+        cells = resolutions(waveform, antennas, passes)
+        turn = antennas.turn(waveform.wavelength, passes)
+        return cls(cells, Ambiguity.of(waveform, passes), turn)
+
+    def explained(
+        self, off: np.ndarray, std: np.ndarray, one_way: bool | np.ndarray = False
+    ) -> np.ndarray:
+        """Return whether differences (..., 4) of paths' measures are insignificant, by their
+        deviations and whether they are of an active terminal's echo over a wall on `one_way` (...).
+        """
+        off = wrapped(off, self.ambiguity)
+        if np.isfinite(self.turn):
+            off[..., 2:] -= self.turn * np.round(off[..., 2:] / self.turn)
+        share = np.where(np.asarray(one_way)[..., None], ONE_WAY_SHARE, RESOLUTION_SHARE)
+        share = np.where([False, False, True, True], share, RESOLUTION_SHARE)
+        allowed = DEVIATIONS * std + share * self.resolution
+        hit: np.ndarray = (np.abs(off) <= allowed).all(axis=-1)
+        return hit
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """Result of the test for K tracks.
+
+    Attributes
+    ----------
+    mirrored : (K,) int32 face of the wall that explains the track as an echo of a nearer one, -1:
+        none does
+    source : (K,) int64 id of that nearer track, -1: none, or one that the terminal was told of
+    order : (K,) int8 bounces: 1 off that wall on one of the two ways, 2 on both, 0: none. At a
+        passive terminal the second wall may be another; `mirrored` is the first
+    behind : (K,) int32 face that hides the place of the track from the terminal or, at a passive
+        one, from its transmitter, -1: it is in sight
+    """
+
+    mirrored: np.ndarray
+    source: np.ndarray
+    order: np.ndarray
+    behind: np.ndarray
+
+    @property
+    def suspect(self) -> np.ndarray:
+        """(K,) bool"""
+        return (self.mirrored >= 0) | (self.behind >= 0)
+
+
+def suspicion(
+    tracks: TrackSet,
+    own: Pose,
+    walls: Walls,
+    leeway: Leeway,
+    told: TrackSet | None = None,
+    asked: np.ndarray | None = None,
+) -> Suspicion:
+    """Hold the tracks of a terminal against the mesh.
+
+    Parameters
+    ----------
+    tracks : TrackSet of an active terminal (its own echoes), or of a passive one with its
+        reference, which itself is not suspected
+    own : its pose
+    walls : the mesh
+    leeway : what detections leave open
+    told : likewise, bodies that others say there are; with the same reference. Those that are not
+        known to a resolution would explain anything, and are left out
+    asked : (K,) bool, the tracks that may lie behind a wall; None: all but the reference
+    """
+    count = len(tracks)
+    out = Suspicion(
+        np.full(count, -1, np.int32),
+        np.full(count, -1),
+        np.zeros(count, np.int8),
+        np.full(count, -1, np.int32),
+    )
+    measured = tracks.measured
+    sender = tracks.mean[tracks.is_reference][0] if tracks.is_reference.any() else None
+    seen_from = [own.position] if sender is None else [own.position, own.position + sender[:3]]
+    for k in np.flatnonzero(~tracks.is_reference if asked is None else asked):
+        out.behind[k] = hidden_by(
+            own.position + tracks.mean[k, :3],
+            tracks.covariance[k, :3, :3],
+            seen_from,
+            walls,
+            leeway.resolution[0],
+        )
+    sources = [(tracks, int(s)) for s in np.flatnonzero(tracks.confirmed & (out.behind < 0))]
+    if told is not None:
+        sure = (told.std < leeway.resolution).all(axis=1)
+        sources += [(told, int(s)) for s in np.flatnonzero(sure & ~told.is_reference)]
+    reach = 2 * float(np.max(tracks.range, initial=0.0)) + 1
+    for known, s in sources:
+        if sender is None:
+            shown = echoes(known.mean[s], own, walls, reach)
+        else:
+            start = None if known.is_reference[s] else sender
+            shown = reflections(known.mean[s], start, own, walls, reach)
+        if not shown:
+            continue
+        std = np.hypot(tracks.std, known.std[s])
+        may_be = ~tracks.is_reference & (tracks.range > known.range[s])
+        if known is told:  # a track of the body itself is no echo of it
+            may_be &= ~leeway.explained(measured - told.measured[s], std)
+        faces, orders, ways = (np.array(of) for of in zip(*shown, strict=True))
+        one_way = (orders == 1) & (sender is None)
+        hit = leeway.explained(measured[:, None] - ways, std[:, None], one_way) & may_be[:, None]
+        which, new = hit.argmax(axis=1), hit.any(axis=1) & (out.mirrored < 0)
+        out.mirrored[new], out.order[new] = faces[which[new]], orders[which[new]]
+        out.source[new] = known.ids[s]
+    return out
+
+
+def echoes(
+    state: np.ndarray, own: Pose, walls: Walls, reach: float = np.inf
+) -> list[tuple[int, int, np.ndarray]]:
+    """Return a target's echoes over each single wall: (face, order, (4,) range, range rate, u_x,
+    u_z), images beyond `reach` [m] left out.
+
+    `state` (6,) is position and velocity relative to the terminal, world axes. Over the wall on
+    both ways the echo is the image's. Over it on one way two equal waves arrive, from the body and
+    from the image, at the mean of the two ranges; where the virtual array, which adds the phases of
+    both ways, points then is left open: at the body, at the image or midway.
+    """
+    here = np.concatenate([own.position, own.velocity])
+    body = state + here
+    direct, out = measure(body, own), []
+    for face, image in _images(body, here, walls, reach):
+        mirrored = measure(image, own)
+        middle = (direct + mirrored) / 2
+        out += [
+            (face, 1, np.concatenate([middle[:2], way[2:]])) for way in (direct, mirrored, middle)
+        ]
+        out += [(face, 2, mirrored)]
+    return out
+
+
+def reflections(
+    state: np.ndarray,
+    sender: np.ndarray | None,
+    own: Pose,
+    walls: Walls,
+    reach: float = np.inf,
+) -> list[tuple[int, int, np.ndarray]]:
+    """Return a target's paths over walls at a passive terminal, one wall on each segment at most:
+    (first face, order, (4,) path length, its rate, u_x, u_z), images beyond `reach` [m] of either
+    end left out.
+
+    `state` and `sender` (6,) are the body's and the active terminal's, relative to the own pose.
+    With `sender` None the body is the active terminal itself: its line of sight over a wall. The
+    wave comes from the body, or from its image in the last wall.
+    """
+    here = np.concatenate([own.position, own.velocity])
+    body = state + here
+    back = [(-1, body), *_images(body, here, walls, reach)]
+    if sender is None:
+        return [(face, 1, measure(image, own)) for face, image in back[1:]]
+    start, out = sender + here, []
+    heard = [(face, measure(seen, own)) for face, seen in back]
+    for first, image in [(-1, body), *_images(body, start, walls, reach)]:
+        way = np.append(lengths(image[None], start)[0], [0.0, 0.0])
+        for last, seen in heard:
+            order = (first >= 0) + (last >= 0)
+            if order:
+                out.append((first if first >= 0 else last, order, seen + way))
+    return out
+
+
+def _images(
+    body: np.ndarray, end: np.ndarray, walls: Walls, reach: float
+) -> list[tuple[int, np.ndarray]]:
+    """Mirror images (6,) of a body (6,) in the walls that show it to an end (6,) within reach [m],
+    world coordinates, with the walls' faces."""
+    mirrors, images = walls.images(body, end, reach, MEETING)
+    return [(int(walls.mirrors[0][k]), image) for k, image in zip(mirrors, images, strict=True)]
+
+
+def hidden_by(
+    place: np.ndarray,
+    covariance: np.ndarray,
+    seen_from: list[np.ndarray],
+    walls: Walls,
+    range_resolution: float,
+) -> int:
+    """The face that a place (3,) lies behind by more than it may be off, seen from any of the
+    points; -1: none."""
+    for start in seen_from:
+        for face in walls.blocking(start, place):
+            n = walls.city.normals[face]
+            depth = abs(n @ place - walls.city.plane_offsets[face] - n @ walls.city.origin)
+            if (
+                depth
+                > DEVIATIONS * np.sqrt(n @ covariance @ n) + RESOLUTION_SHARE * range_resolution
+            ):
+                return int(face)
+    return -1

@@ -1,0 +1,175 @@
+"""Mirror images that a terminal receives over the walls of its mesh: its own, or its transmitter's.
+
+A wall that is met at a right angle sends the terminal's chirps straight back, and so does a corner
+of two planes, wall and ground above all, whatever the angle. Such an echo stands still in the world
+but is a point as a UAV is, and the scatterers of the expected clutter do not hold it. The terminal
+knows its pose and the mesh, so that it knows the range of each and its rate. Occlusion by other
+buildings is not asked for: an image that is not there only forbids births in a few cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from isac_rt.extensions.city_receivers.walls import Walls, lengths
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.waveform import Waveform
+from isac_rt.kernels import track_images
+from isac_rt.kernels.jit import twin_of
+from isac_rt.kernels.track_images import EDGE, LEAST_RANGE
+from isac_rt.receive.types import Detections
+from isac_rt.track.filter import Ambiguity, wrapped
+from isac_rt.track.parts import Own, TrackRule
+from isac_rt.world.swarm import Pose
+
+BESIDE_CELLS = 1.5
+"""Off an image by no more cells of range and of rate than these, a detection is taken for it."""
+WELL_INSIDE = 0.95
+"""Share of the view's largest cosines within which a direction is no alias of one outside."""
+ALIAS_DEVIATIONS = 3.0
+"""So many deviations further inside at a passive terminal, whose array is a third as long."""
+
+
+class Images(TrackRule):
+    """No track starts from what may be an image of the terminal, at a passive one of its
+    transmitter, or an alias from beyond the view.
+
+    Parameters
+    ----------
+    walls : the mesh
+    passes : 2 at an active terminal, 1 at a passive one
+    """
+
+    def __init__(self, walls: Walls, antennas: Antennas, waveform: Waveform, passes: int) -> None:
+        self._walls, self._passes = walls, passes
+        self._edge = WELL_INSIDE * antennas.view_limit
+        self._ambiguity = Ambiguity.of(waveform, passes)
+        self._cells = np.array([waveform.range_cell(passes), waveform.velocity_cell(passes)])
+
+    def births(self, detections: Detections, own: Own) -> Detections:
+        d, sender = detections, own.transmitter
+        spread = ALIAS_DEVIATIONS * d.std[:, 2:] if self._passes == 1 else 0.0
+        inside = np.abs(d.direction) + spread < self._edge
+        starts = d.starts & inside.all(axis=1)
+        if starts.any():
+            reach = float(d.range[starts].max()) + 1
+            if sender is None:
+                shown = own_images(own.pose, self._walls, reach)
+            else:
+                shown = sender_images(sender.mean[:6], own.pose, self._walls, reach)
+            off = wrapped(d.measured[:, None, :2] - shown, self._ambiguity)
+            beside = (np.abs(off) < BESIDE_CELLS * self._cells).all(axis=-1)
+            starts &= ~beside.any(axis=1)
+        return replace(d, starts=starts)
+
+
+def own_images(own: Pose, walls: Walls, reach: float) -> np.ndarray:
+    """Range [m] and its rate [m/s] of the terminal's own images, one way as its echoes: (K, 2).
+
+    Parameters
+    ----------
+    own : pose, world coordinates
+    reach : farthest range that counts [m]
+    """
+    near = walls.near(own, reach)
+    here = np.concatenate([own.position, own.velocity])
+    return _images(here, here, walls, (near, near), 2 * reach) / 2
+
+
+def sender_images(sender: np.ndarray, own: Pose, walls: Walls, reach: float) -> np.ndarray:
+    """Length [m] and its rate [m/s] of the ways from a transmitter to a passive terminal over one
+    or two planes: (K, 2).
+
+    Parameters
+    ----------
+    sender : (6,) position and velocity of the transmitter, world coordinates
+    own : pose of the terminal
+    reach : longest way that counts [m]
+    """
+    here = np.concatenate([own.position, own.velocity])
+    near = walls.about(sender[:3], reach), walls.near(own, reach)
+    return _images(sender, here, walls, near, reach)
+
+
+def _images(
+    start: np.ndarray,
+    end: np.ndarray,
+    walls: Walls,
+    near: tuple[np.ndarray, np.ndarray],
+    reach: float,
+) -> np.ndarray:
+    """Ways from `start` to `end` (6,), over mirrors that are near the one and the other."""
+    return np.concatenate(
+        [_by_one(start, end, walls, near[1], reach), _by_two(start, end, walls, near, reach)]
+    )
+
+
+def _by_one(
+    start: np.ndarray, end: np.ndarray, walls: Walls, near: np.ndarray, reach: float
+) -> np.ndarray:
+    _, images = walls.images(start, end, reach, EDGE, near)
+    found = lengths(images, end)
+    return found[found[:, 0] > 2 * LEAST_RANGE]
+
+
+def _by_two(
+    start: np.ndarray,
+    end: np.ndarray,
+    walls: Walls,
+    near: tuple[np.ndarray, np.ndarray],
+    reach: float,
+) -> np.ndarray:
+    """The wave over plane i, then j, comes from the image p_ij of the start's image in i; it meets
+    j at B, and i at A."""
+    _, normals, offsets = walls.mirrors
+    pairs, places = met(start[:3], end[:3], normals, offsets, *walls.boxes, *near, reach)
+    i, j = pairs.T
+    A, B, at_j = places.swapaxes(0, 1)
+    kept = walls.holds(i, A, EDGE) & walls.holds(j, B, EDGE)
+    n, m, at_j = normals[i[kept]], normals[j[kept]], at_j[kept]
+    turned = start[3:] - 2 * (n @ start[3:])[:, None] * n
+    turned -= 2 * (turned * m).sum(axis=1)[:, None] * m
+    return lengths(np.hstack([at_j, turned]), end)
+
+
+@twin_of(track_images.met)
+def met(
+    start: np.ndarray,
+    end: np.ndarray,
+    normals: np.ndarray,
+    offsets: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    first: np.ndarray,
+    last: np.ndarray,
+    reach: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (K, 2) of mirrors, one of `first` and one of `last`, over which a path of at most
+    `reach` [m] may lead from `start` to `end` (3,), with A, B and p_ij (K, 3, 3).
+
+    Mirrors have normals (W, 3), offsets (W,) and boxes from `low` to `high` (W, 3). A point x has
+    the image x - 2 (n.x - d) n; the square of its distance from a point on its own side is longer
+    by 4 (n.x - d) (n.y - d) than that of x itself.
+    """
+    pairs, places = [np.zeros((0, 2), np.int64)], [np.zeros((0, 3, 3))]
+    before = normals[last] @ end - offsets[last]
+    for i in first:
+        s = normals[i] @ start - offsets[i]
+        once = start - 2 * s * normals[i]
+        apart, beyond = ((once - end) ** 2).sum(), normals[last] @ once - offsets[last]
+        longer = 4 * beyond * before
+        some = (longer > max((2 * LEAST_RANGE) ** 2 - apart, 0)) & (longer < reach**2 - apart)
+        some &= last != i
+        j, share = last[some], (beyond[some] / (beyond[some] + before[some]))[:, None]
+        at_j = once - 2 * beyond[some, None] * normals[j]
+        B = at_j + (end - at_j) * share
+        height = B @ normals[i] - offsets[i]
+        A = once + (B - once) * (s / (s + height))[:, None]
+        on = height * s > -EDGE * abs(s)
+        for point, of in ((B, j), (A, i)):
+            on &= ((low[of] - EDGE <= point) & (point <= high[of] + EDGE)).all(axis=1)
+        pairs.append(np.column_stack([np.full(on.sum(), i), j[on]]))
+        places.append(np.stack([A, B, at_j], axis=1)[on])
+    return np.concatenate(pairs), np.concatenate(places)

@@ -1,0 +1,215 @@
+"""Data without a line of sight: paths found in data frames alone, and frames read late by them.
+
+A passive terminal that cannot read a data frame keeps what is strongest in every chirp. Once a
+batch of such frames, or a pilot among them, shows a path (`blind`), all of
+the batch are read, and the frames that follow are read over that path as they come, as long as it
+lasts. Any path carries the data. Whether it is the line of sight shows the frame itself, once its
+data are out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from isac_rt.extensions.city_receivers.blind import DataPath, Peaks, acquire, find_peaks, read_peaks
+from isac_rt.extensions.city_receivers.images import WELL_INSIDE, sender_images
+from isac_rt.extensions.city_receivers.walls import Walls
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.passive import PassiveReceiver
+from isac_rt.receive.types import Detections, Hints, Reception
+from isac_rt.track.filter import measure
+from isac_rt.track.parts import Late, OtherPaths, Own, delayed
+from isac_rt.track.reference import COAST_CELLS, Reference
+
+BATCH = 8
+"""Frames kept at most."""
+SPAN = 0.5
+"""Age at which a frame is let go [s]: longer flights bend more than the comb tries."""
+GATE_CELLS, GATE_STDS = 0.4, 3.0
+"""Cells, or deviations of what is predicted, within which the path is found again in a frame that
+was read over it."""
+STD_CELLS = 0.02
+"""Floor of its range and velocity deviations in cells."""
+NAMED_CELLS = 1.5
+"""Cells of length and of its rate within which a path is one that the city explains."""
+FIRST_BEND = 3.0
+"""Deviation of the acceleration of a path that is seen for the first time [m/s^2]."""
+
+
+@dataclass
+class Waiting:
+    """Frames that wait for a path, and the path over which frames are read now; None: none is
+    known."""
+
+    batch: list[Peaks] = field(default_factory=list)
+    path: DataPath | None = None
+
+
+class Retrospect(OtherPaths):
+    """Frames that a passive terminal could not read, and the path over which it reads now.
+
+    Parameters
+    ----------
+    receiver : of the terminal
+    walls : the mesh, by which a path over walls is recognised; None: no path is
+
+    Attributes
+    ----------
+    late : earlier frames that the last one made readable
+    """
+
+    def __init__(
+        self, receiver: PassiveReceiver, waveform: Waveform, walls: Walls | None = None
+    ) -> None:
+        self._receiver, self._waveform, self._walls = receiver, waveform, walls
+        self._cells = np.array([waveform.range_cell(1), waveform.velocity_cell(1)])
+        self.state = Waiting()
+        self.late: tuple[Late, ...] = ()
+
+    @property
+    def is_reading(self) -> bool:
+        return self.state.path is not None
+
+    def read_frame(
+        self,
+        cube: IFCube,
+        reception: Reception,
+        own: Own,
+        reference: Reference,
+        *,
+        refused: bool,
+        anchored: bool,
+        maps: bool,
+    ) -> tuple[Reception, bool]:
+        self.late = ()
+        if anchored:
+            self.look(cube, own.time)
+            if refused:
+                self.start(delayed(reception.detections, own.clock), own.time)
+        if reception.line_of_sight:
+            self.forget()
+        if anchored or reception.decoded:
+            return reception, anchored
+        out = self.read(cube, own.time, Hints(own.clutter), maps=maps)
+        if out is None:
+            return reception, False
+        out = replace(out, detections=delayed(out.detections, own.clock, -1))
+        if out.line_of_sight and reference.is_plausible(out) and self._is_well_inside(out):
+            self.forget()
+            return out, True
+        return out.without_sight(self._is_named(own)), False
+
+    def _is_named(self, own: Own) -> bool:
+        """Return whether the path that is read over is as long, and changes as fast, as a path from
+        the transmitter over the city's walls or about an edge."""
+        path = self.state.path
+        if self._walls is None or path is None or not own.over_other_path or own.sender is None:
+            return False
+        there = own.sender.state.mean
+        length = path.mean[:2] - SPEED_OF_LIGHT * own.clock
+        straight = measure(there, own.pose)[None, :2]
+        over_walls = sender_images(there[:6], own.pose, self._walls, float(length[0]) + 1)
+        apart = np.abs(np.concatenate([straight, over_walls]) - length)
+        return bool((apart < NAMED_CELLS * self._cells).all(axis=1).any())
+
+    def _is_well_inside(self, reception: Reception) -> bool:
+        """Return whether the reference is not so near the edge of the view that it may have come
+        from the opposite one: a track of it would fly elsewhere."""
+        d = reception.detections
+        edge = WELL_INSIDE * self._receiver.antennas.view_limit
+        return bool((np.abs(d.direction[d.is_reference]) < edge).all())
+
+    def read(
+        self,
+        cube: IFCube,
+        time: float,
+        hints: Hints,
+        *,
+        maps: bool,
+    ) -> Reception | None:
+        """A data frame that the line of sight does not read, over the path that is known or that it
+        makes known; None where there is none yet."""
+        if self.state.path is not None:
+            out = self._over(cube, time, hints, maps=maps)
+            if out is not None:
+                return out
+        self.state.path = self._learn(cube, time, True)
+        if self.state.path is None:
+            return None
+        return self._over(cube, time, hints, maps=maps)
+
+    def look(self, cube: IFCube, time: float) -> None:
+        """A frame without data, which tells the whole cells of those that wait."""
+        if self.state.batch:
+            self.state.path = self._learn(cube, time, False) or self.state.path
+
+    def start(self, detections: Detections, time: float) -> None:
+        """Go on over the strongest path of a frame without data whose reference is none."""
+        d = detections.select(np.isfinite(detections.direction).all(axis=1))
+        if len(d):
+            i = int(d.snr.argmax())
+            mean = np.array([d.range[i], d.velocity[i], 0.0])
+            spread = np.append(self._deviations(d, i), FIRST_BEND) ** 2
+            self.state.path = DataPath(time, mean, np.diag(spread), d.direction[i])
+
+    def forget(self) -> None:
+        """The line of sight reads again."""
+        self.state = Waiting()
+
+    def _learn(self, cube: IFCube, time: float, modulated: bool) -> DataPath | None:
+        """Keep a frame, and read those that wait where it makes a path known."""
+        young = [one for one in self.state.batch if time - one.time <= SPAN]
+        groups = self._receiver.groups
+        mine = cube if groups is None else cube.of_groups(groups)
+        self.state.batch = [*young[1 - BATCH :], find_peaks(mine, time, modulated)]
+        order = self._receiver.reader.order
+        path = acquire(self.state.batch, self._receiver.antennas, order)
+        if path is None:
+            return None
+        waiting, self.state.batch = self.state.batch, []
+        for one in waiting:
+            if one.modulated and one.time < time:
+                there = path.at(one.time).prediction
+                symbols = read_peaks(one, there, self._receiver.antennas, order)
+                if symbols is None:
+                    continue
+                reception = self._receiver.of_symbols(symbols, one.waveform, self._waveform)
+                if reception is not None:
+                    self.late += (Late(one.time, reception),)
+        return path
+
+    def _over(
+        self,
+        cube: IFCube,
+        time: float,
+        hints: Hints,
+        *,
+        maps: bool,
+    ) -> Reception | None:
+        """A frame read over the path, which it makes known better; None where it cannot be."""
+        assert self.state.path is not None
+        self.state.path = self.state.path.at(time)
+        expected = self.state.path.prediction
+        if expected.range_std[0] > COAST_CELLS * self._cells[0]:
+            return None
+        out = self._receiver.receive_over(cube, expected, hints, maps=maps)
+        if not out.decoded:
+            return None
+        d = out.detections
+        off = np.abs(np.stack([d.range, d.velocity]).T - self.state.path.mean[:2])
+        gate = np.maximum(
+            GATE_CELLS * self._cells, GATE_STDS * np.sqrt(np.diag(self.state.path.covariance)[:2])
+        )
+        near = (off < gate).all(axis=1) & np.isfinite(d.direction).all(axis=1)
+        if near.any():
+            i = int(np.where(near, d.snr, -1.0).argmax())
+            measured = np.array([d.range[i], d.velocity[i]])
+            self.state.path = self.state.path.seen(measured, self._deviations(d, i), d.direction[i])
+        return out
+
+    def _deviations(self, detections: Detections, i: int) -> np.ndarray:
+        """Return the standard deviations of range and velocity of a detection (2,)."""
+        return np.maximum(detections.std[i, :2], STD_CELLS * self._cells)

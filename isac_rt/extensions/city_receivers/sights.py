@@ -1,0 +1,117 @@
+"""A terminal that learns of its hardware from strong paths that come from where it knows that
+somebody is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from isac_rt.extensions.city_receivers.self_calibration import FREE, Change, SelfCalibration, Sight
+from isac_rt.frame.antennas import unit_vector
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.receive.types import Look, Reception
+from isac_rt.track.filter import Ambiguity, Gaussian, measure, wrapped
+from isac_rt.track.parts import Own
+from isac_rt.track.tracker import Track, Tracker, TrackSet
+from isac_rt.world.swarm import Pose
+
+POSITION_STD, VELOCITY_STD = 0.02, 0.05
+"""Of what terminals say of themselves, per axis: satellites by carrier phase, and their velocities
+[m, m/s]."""
+NEAR_CELLS = 1.5
+"""Cells of range and of velocity within which a path is the one that is expected."""
+
+
+class LearnedHardware(SelfCalibration):
+    """The terminal's estimate of its hardware, fed by the frames that it receives."""
+
+    def learn_from(
+        self, reception: Reception, own: Own, tracker: Tracker, reference: Track | None
+    ) -> None:
+        if self._passes == 2:
+            tracks = tracker.snapshot(own.pose)
+            seen = echoes(reception.looks, self.waveform, own.pose, own.mates, tracks)
+        elif reference is None or reference.missed:
+            return
+        else:
+            seen = lines_of_sight(reception.looks, own.pose, own.mates, reference.state)
+        change = self.learn_all(seen, reception.neighbours if self._passes == 2 else None)
+        if reference is not None:
+            reference.state = seen_after(reference.state, own.pose, change, 1)
+        for track in tracker.tracks:
+            track.state = seen_after(track.state, own.pose, change, 2)
+
+
+def echoes(
+    looks: Sequence[Look],
+    waveform: Waveform,
+    own: Pose,
+    mates: Sequence[Pose],
+    tracks: TrackSet,
+) -> list[tuple[Look, Sight]]:
+    """Looks at an active terminal that show another terminal or a confirmed track, each once, the
+    terminals first."""
+    out, left = [], list(looks)
+    for pose in mates:
+        expected, sight = _known(pose, own, 2)
+        nearest = _nearest(left, expected[:2], waveform)
+        if own.to_body(pose.position - own.position)[1] > 0 and nearest is not None:
+            out.append((left.pop(nearest), sight))
+    for k in np.flatnonzero(tracks.confirmed & (tracks.detection >= 0)):
+        expected = np.array([tracks.range[k], tracks.velocity[k]])
+        nearest = _nearest(left, expected, waveform)
+        if nearest is not None and np.isfinite(tracks.direction[k]).all():
+            sight = Sight(tracks.direction[k], float(tracks.range[k]), FREE)
+            out.append((left.pop(nearest), sight))
+    return out
+
+
+def lines_of_sight(
+    looks: Sequence[Look], own: Pose, mates: Sequence[Pose], reference: Gaussian
+) -> list[tuple[Look, Sight]]:
+    """The look of a passive terminal at its transmitter, which says where it is or is tracked."""
+    if mates:
+        return [(look, _known(mates[0], own, 1)[1]) for look in looks]
+    z = measure(reference.mean, own)
+    return [(look, Sight(z[2:], float(z[0]), FREE)) for look in looks]
+
+
+def _known(pose: Pose, own: Pose, passes: int) -> tuple[np.ndarray, Sight]:
+    """Range, its rate and direction cosines of another terminal, and the path to it and maybe
+    back."""
+    z = measure(np.concatenate([pose.position, pose.velocity]), own)
+    of_path = np.array([z[0], z[1], POSITION_STD, VELOCITY_STD]) * passes / SPEED_OF_LIGHT
+    delay, rate, delay_std, rate_std = map(float, of_path)
+    path = delay, rate, delay_std, rate_std
+    return z, Sight(z[2:], float(z[0]), POSITION_STD / float(z[0]), path)
+
+
+def _nearest(looks: Sequence[Look], expected: np.ndarray, waveform: Waveform) -> int | None:
+    """The strongest echo within `NEAR_CELLS` of a range and a velocity."""
+    w, best, most = waveform, None, 0.0
+    cells = np.array([w.range_cell(2), w.velocity_cell(2)])
+    for i, look in enumerate(looks):
+        found = np.array([look.delay, look.delay_rate]) * SPEED_OF_LIGHT / 2
+        apart = wrapped(found - expected, Ambiguity.of(w, 2))
+        power = float(np.sum(np.abs(look.modes[0]) ** 2))
+        if (np.abs(apart) < NEAR_CELLS * cells).all() and power > most:
+            best, most = i, power
+    return best
+
+
+def seen_after(state: Gaussian, own: Pose, change: Change, passes: int) -> Gaussian:
+    """A body as it is seen once the hardware is known better, by paths that pass the way to it so
+    often."""
+    body = own.to_body(state.mean[:3] - own.position)
+    distance = np.linalg.norm(body)
+    if body[1] <= 0:  # out of view
+        return state
+    u = body[[0, 2]] / distance - change.direction
+    towards = own.to_world(unit_vector(u * min(1.0, 1 / np.linalg.norm(u))))
+    mean, metres = state.mean.copy(), SPEED_OF_LIGHT / passes
+    mean[:3] = own.position + towards * (distance - change.delay * metres)
+    mean[3:6] -= towards * (change.rate * metres)
+    covariance, axes = state.covariance.copy(), own.rotation[:, [0, 2]] * distance
+    covariance[:3, :3] += (axes * change.spread**2) @ axes.T
+    return Gaussian(mean, covariance)

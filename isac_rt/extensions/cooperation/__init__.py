@@ -1,0 +1,1 @@
+"""Fused tracks of cooperating terminals, by messages with tracks or with detections."""

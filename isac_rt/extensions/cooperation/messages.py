@@ -1,0 +1,381 @@
+"""Messages between terminals about tracks and detections, and the time that a link takes to carry
+them.
+
+An active terminal's messages ride on its data frames, a passive one's go back by its feedback. A
+message is made of what its sender knows after a frame and leaves with the next; it takes as many
+frames as its bits need and is lost with any of them, until the frame is read late. Nobody waits for
+an answer, and nothing is said twice unless it has changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import ceil
+
+import numpy as np
+
+from isac_rt.extensions.city_receivers.retrospect import BATCH
+from isac_rt.extensions.cooperation.fusion import Picture, Report, Told, advance, at_once, its_word
+from isac_rt.extensions.cooperation.pool import Look, PooledTracker
+from isac_rt.plain import Stateful
+from isac_rt.track.filter import Gaussian
+from isac_rt.track.fused import Fused, Key, Name
+
+HEADER_BITS = 64
+"""Sender, time, length and checksum of a message."""
+TERMINAL_BITS = 16 + 3 * 24 + 3 * 16
+"""What is said of a terminal itself: age, position to a centimetre, velocity to a millimetre a
+second."""
+NUMBER_BITS = 16
+"""One of the numbers of the tracks that a terminal keeps."""
+REPORT_BITS = 8 + 16 + 16 + 40 + 120 + 6 * 16 + 15 * 8 + 8
+"""A track: whose, number, age, name, mean (24 bits of each position, 16 of each velocity),
+deviations and correlations, and how far the clock moves it; what the errors of the pose do follows
+from the terminal's own place. What these bits round off is not modelled: a centimetre and less."""
+LOOK_BITS = 16 + 16 + 3 * 24 + 3 * 16 + 3 * 16 + 8
+"""Of one frame of a link: which, when, the receiver's position, velocity and attitude, how well its
+clock is known."""
+DETECTION_BITS = 24 + 16 + 2 * 14 + 4 * 8 + 8 + 16 + 1 + 40
+"""Range, rate, two cosines, their deviations, level, number of its track and whether that is
+confirmed, name of the body."""
+CODE_RATE = 0.5
+"""Share of an active terminal's bits that messages get; the rest protects them."""
+CORRECTED = 0.05
+"""Largest share of a frame's bits wrong that such a code corrects: hard decisions at rate 1/2 reach
+some 0.06 with frames of two thousand bits."""
+HOLD_S = 0.5
+"""How long something that was said counts without being said again [s]."""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """The numbers of all tracks that a link's receiver kept at a time [s], and by whom they were
+    said: "" by the terminal itself."""
+
+    time: float
+    numbers: tuple[int, ...]
+    via: str = ""
+
+
+@dataclass(frozen=True)
+class Said:
+    """Position and velocity (6,) that a terminal reported of itself at a time [s]."""
+
+    time: float
+    state: Gaussian
+    via: str = ""
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message.
+
+    Attributes
+    ----------
+    sender : its name
+    terminals : what it knows that terminals said of themselves, itself included
+    kept : by link
+    reports : of tracks, its own and others'
+    looks : detections, its own and others'
+    left_out : tracks or detections that were new and that it had no room for
+    """
+
+    sender: str
+    terminals: Mapping[str, Said]
+    kept: Mapping[str, Kept]
+    reports: Sequence[Report]
+    looks: Sequence[Look] = ()
+    left_out: int = 0
+
+    @property
+    def bits(self) -> int:
+        """Its length."""
+        numbers = sum(len(kept.numbers) for kept in self.kept.values())
+        return (
+            HEADER_BITS
+            + TERMINAL_BITS * len(self.terminals)
+            + NUMBER_BITS * numbers
+            + REPORT_BITS * len(self.reports)
+            + sum(_bits(look, len(look)) for look in self.looks)
+        )
+
+
+@dataclass
+class Channel(Stateful):
+    """The way from one terminal to another: one message at a time.
+
+    Attributes
+    ----------
+    message : on its way, None: the channel is free
+    left : bits of it that have still to come
+    missed : frames of it that were not read
+    waiting : messages whose last frame is over, with the frames of each that may be read late
+    """
+
+    message: Message | None = None
+    left: int = 0
+    missed: set[int] = field(default_factory=set)
+    waiting: list[tuple[Message, set[int]]] = field(default_factory=list)
+
+    def send(self, message: Message) -> None:
+        """Put a message on its way; its first frame is the next."""
+        self.message, self.left, self.missed = message, message.bits, set()
+
+    def carry(self, frame: int, capacity: int, read: bool) -> tuple[Message, bool] | None:
+        """Let a frame pass that holds `capacity` bits for it and was `read` or not: the message if
+        this was its last frame, and whether it arrived."""
+        if self.message is None or capacity <= 0:
+            return None
+        self.left -= capacity
+        if not read:
+            self.missed.add(frame)
+        if self.left > 0:
+            return None
+        message, self.message = self.message, None
+        self.waiting = [(m, f) for m, f in self.waiting if min(f) > frame - BATCH]
+        if self.missed:
+            self.waiting.append((message, self.missed))
+        return message, not self.missed
+
+    def late(self, frame: int) -> list[Message]:
+        """Messages, whole only now that a frame was read which had passed unread."""
+        self.missed.discard(frame)
+        for _, missed in self.waiting:
+            missed.discard(frame)
+        whole = [message for message, missed in self.waiting if not missed]
+        self.waiting = [(message, missed) for message, missed in self.waiting if missed]
+        return whole
+
+
+@dataclass
+class Notes(Stateful):
+    """Tracks that a terminal knows from itself and from others, and what it has reported to whom.
+
+    Attributes
+    ----------
+    name : of the terminal
+    reports : the latest of every track, and by whom each was said ("": its own)
+    kept : by link the tracks that its receiver keeps
+    terminals : what they said of themselves
+    told : by listener the time of each track's report that went there last [s]
+    picture : what it makes of all this
+    """
+
+    name: str
+    reports: dict[Key, tuple[Report, str]] = field(default_factory=dict)
+    kept: dict[str, Kept] = field(default_factory=dict)
+    terminals: dict[str, Said] = field(default_factory=dict)
+    told: dict[str, dict[Key, float]] = field(default_factory=dict)
+    picture: Picture = field(default_factory=Picture)
+
+    def see(self, origin: str, time: float, tracks: Mapping[int, Told]) -> None:
+        """Take down the tracks of one of its own links after a frame, by their numbers; tracks that
+        were there before have begun before."""
+        mine = [key for key in self.reports if key.origin == origin]
+        before = {key: self.reports.pop(key)[0] for key in mine}
+        for number, (state, lever) in tracks.items():
+            key = Key(origin, number)
+            since = before[key].since if key in before else time
+            name = before[key].name if key in before else Name(since, *key)
+            self.reports[key] = Report(key, since, name, time, state, lever), ""
+        self.kept[origin] = Kept(time, tuple(tracks))
+
+    def stand(self, time: float, state: Gaussian) -> None:
+        """Take down where it is itself."""
+        self.terminals[self.name] = Said(time, state)
+
+    def hear(self, message: Message) -> None:
+        """Take down what is newer than what it knows."""
+        sender = message.sender
+        for name, said in message.terminals.items():
+            if name != self.name and self._newer(said.time, self.terminals.get(name)):
+                self.terminals[name] = replace(said, via=sender)
+        for origin, kept in message.kept.items():
+            if self._newer(kept.time, self.kept.get(origin)):
+                self.kept[origin] = replace(kept, via=sender)
+        for report in message.reports:
+            known = self.reports.get(report.key)
+            if self._newer(report.time, None if known is None else known[0]):
+                self.reports[report.key] = report, sender
+
+    @staticmethod
+    def _newer(time: float, known: Said | Kept | Report | None) -> bool:
+        return known is None or time > known.time
+
+    def look(self, time: float, acceleration_std: float) -> list[Fused]:
+        """Its picture at a time [s], after forgetting what has ended or was not said for
+        `HOLD_S`."""
+        self.reports = {k: r for k, r in self.reports.items() if self._counts(r[0], time)}
+        self.terminals = {k: s for k, s in self.terminals.items() if time - s.time <= HOLD_S}
+        fused = self.picture.update(
+            at_once((report for report, _ in self.reports.values()), time, acceleration_std),
+            {
+                name: its_word(said.state).after(time - said.time, acceleration_std)
+                for name, said in self.terminals.items()
+            },
+        )
+        for body in fused:
+            for key in body.members:
+                report, via = self.reports[key]
+                if report.name != body.name:
+                    self.reports[key] = replace(report, name=body.name), via
+        return fused
+
+    def _counts(self, report: Report, time: float) -> bool:
+        kept = self.kept.get(report.key.origin)
+        ended = (
+            kept is not None and kept.time >= report.time and report.key.number not in kept.numbers
+        )
+        return not ended and time - report.time <= HOLD_S
+
+    def compose(self, listener: str, capacity: int) -> Message:
+        """Compose the message to a listener over a channel of `capacity` bits a frame: nothing that
+        came from there, and first the tracks that were not reported for longest. One frame's fill,
+        but one track at least."""
+        told = self.told.setdefault(listener, {})
+        bare = Message(
+            self.name,
+            {k: s for k, s in self.terminals.items() if listener not in (k, s.via)},
+            {k: s for k, s in self.kept.items() if s.via != listener},
+            [],
+        )
+        new = [
+            report
+            for report, via in self.reports.values()
+            if via != listener and report.time > told.get(report.key, -1.0)
+        ]
+        new.sort(key=lambda report: (told.get(report.key, -1.0), report.key))
+        room = ceil(bare.bits / capacity) * capacity - bare.bits
+        chosen = new[: max(1, room // REPORT_BITS)]
+        told |= {report.key: report.time for report in chosen}
+        return replace(bare, reports=chosen, left_out=len(new) - len(chosen))
+
+    def ages(self, time: float) -> tuple[float, ...]:
+        """Return the ages of what others reported and is still valid [s]."""
+        return tuple(time - report.time for report, via in self.reports.values() if via)
+
+
+@dataclass
+class Noted:
+    """State of the detections that a terminal carries over.
+
+    Attributes
+    ----------
+    terminals : what they said of themselves
+    looks : by time and link, and by whom each was said ("": its own)
+    told : by listener what went there
+    """
+
+    terminals: dict[str, Said] = field(default_factory=dict)
+    looks: dict[tuple[float, str], tuple[Look, str]] = field(default_factory=dict)
+    told: dict[str, set[tuple[float, str]]] = field(default_factory=dict)
+
+
+class Sightings(Stateful):
+    """Detections of others and of the terminal itself, and what it has reported to whom.
+
+    Attributes
+    ----------
+    name : of the terminal
+    tracker : what it makes of all detections
+    """
+
+    def __init__(self, name: str, tracker: PooledTracker) -> None:
+        self.name, self.tracker = name, tracker
+        self.state = Noted()
+
+    @property
+    def parts(self) -> Mapping[str, Stateful | None]:
+        return {"tracker": self.tracker}
+
+    @property
+    def terminals(self) -> dict[str, Said]:
+        """Return what terminals reported of themselves."""
+        return self.state.terminals
+
+    def stand(self, time: float, state: Gaussian) -> None:
+        """Take down where it is itself."""
+        self.terminals[self.name] = Said(time, state)
+
+    def see(self, look: Look) -> None:
+        """Take down the detections of one of its own links after a frame."""
+        self._take(look, "")
+        kept, via = self.state.looks[look.key]
+        self.state.looks[look.key] = replace(kept, names=self.tracker.names_of(kept)), via
+
+    def hear(self, message: Message) -> None:
+        """Take down what it does not know yet."""
+        for name, said in message.terminals.items():
+            known = self.terminals.get(name)
+            if name != self.name and (known is None or said.time > known.time):
+                self.terminals[name] = replace(said, via=message.sender)
+        for look in message.looks:
+            if look.key not in self.state.looks:
+                self._take(look, message.sender)
+
+    def _take(self, look: Look, via: str) -> None:
+        """A look whose transmitter is not known at all says nothing of places."""
+        self.state.looks[look.key] = look, via
+        tx, rx = look.ends
+        if tx == rx:
+            self.tracker.add(look, None)
+        elif tx in self.terminals:
+            said = self.terminals[tx]
+            self.tracker.add(look, _moved(said.state.mean, look.time - said.time))
+
+    def look(self, time: float, acceleration_std: float) -> list[Fused]:
+        """Its picture at a time [s], after forgetting what was not said for `HOLD_S`."""
+        self.state.looks = {k: v for k, v in self.state.looks.items() if time - k[0] <= HOLD_S}
+        self.state.terminals = {k: s for k, s in self.terminals.items() if time - s.time <= HOLD_S}
+        self.tracker.forget(time)
+        known = {
+            name: advance(said.state, time - said.time, acceleration_std)
+            for name, said in self.terminals.items()
+        }
+        return self.tracker.at(time, known)
+
+    def ages(self, time: float) -> tuple[float, ...]:
+        """Return the ages of the detections that others reported and are still valid [s]."""
+        return tuple(
+            time - look.time
+            for look, via in self.state.looks.values()
+            if via
+            for _ in range(len(look))
+        )
+
+    def compose(self, listener: str, capacity: int) -> Message:
+        """Compose the message to a listener over a channel of `capacity` bits a frame: the newest
+        frames first and of each the strongest detections, those of confirmed tracks before all
+        others. What does not fit is not sent later; one detection is sent at least."""
+        terminals = {k: s for k, s in self.terminals.items() if listener not in (k, s.via)}
+        bare = Message(self.name, terminals, {}, [])
+        told = self.state.told.setdefault(listener, set())
+        new = [
+            look
+            for key, (look, via) in self.state.looks.items()
+            if listener not in (via, look.ends[1]) and key not in told
+        ]
+        new.sort(key=lambda look: (-look.time, look.origin))
+        least = bare.bits + (_bits(new[0], min(1, len(new[0]))) if new else 0)
+        room = ceil(least / capacity) * capacity - bare.bits
+        chosen, left = [], sum(map(len, new))
+        for look in new:
+            count = min(len(look), (room - _bits(look, 0)) // DETECTION_BITS)
+            if count < min(1, len(look)):
+                break
+            chosen.append(look.select(look.best(count)))
+            room -= _bits(look, count)
+            left -= count
+        self.state.told[listener] = (told | {look.key for look in new}) & self.state.looks.keys()
+        return replace(bare, looks=chosen, left_out=left)
+
+
+def _bits(look: Look, detections: int) -> int:
+    """Count the bits of a dwell with a number of its detections."""
+    return LOOK_BITS + NUMBER_BITS * len(look.kept) + DETECTION_BITS * detections
+
+
+def _moved(state: np.ndarray, interval: float) -> np.ndarray:
+    """Position and velocity (6,) after an interval [s] of straight flight."""
+    return np.concatenate([state[:3] + interval * state[3:], state[3:]])

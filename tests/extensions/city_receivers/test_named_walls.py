@@ -1,0 +1,145 @@
+"""A passive terminal that reads data over a wall, and senses with them where the city's mesh and
+what the transmitter says of its place explain that path."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from receiver_cubes import ANTENNAS, Path, cube, frame
+from test_images import ORIGIN, VELOCITY, WALL, city, pose
+
+from isac_rt.extensions.city_receivers.standard import Surroundings, passive_terminal
+from isac_rt.frame.payload import random_payload
+from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.settings import Receivers
+from isac_rt.receive.types import Detections
+from isac_rt.track.filter import Gaussian, measure
+from isac_rt.track.parts import Own, follow
+from isac_rt.track.reference import Followed
+from isac_rt.track.settings import Tracking
+from isac_rt.track.tracker import Track
+from isac_rt.world.swarm import Pose
+
+W = Waveform(num_samples=256, num_chirps=48)
+INTERVAL = 0.0041
+OWN = pose([1.7, -3.1, 4.2], [1.0, 0.3, 0.0])
+SENDER = ORIGIN + np.array([3.7, 8.9, 2.2])
+TARGET = ORIGIN + np.array([5.9, 1.4, 5.1])
+IMAGE = SENDER + np.array([2 * (11.3 - 3.7), 0.0, 0.0])
+"""The transmitter flies as the terminal does, so that its image comes nearer by twice the wall's
+speed."""
+
+
+def ways(n):
+    """The way over the wall and the target's echo, of a target that flies along."""
+    moved = VELOCITY * n * INTERVAL
+    mirrored = moved * [-1, 1, 1]
+    out = []
+    for place, motion, before, amplitude in (
+        (IMAGE + mirrored, VELOCITY * [-1, 1, 1], 0.0, 0.5),
+        (TARGET + moved, VELOCITY, float(np.linalg.norm(TARGET - SENDER)), 0.08),
+    ):
+        span = place - OWN.position - moved
+        e = span / np.linalg.norm(span)
+        length, rate = before + float(span @ e), float(e @ (motion - VELOCITY))
+        out.append(Path(length, rate, amplitude, arrival=tuple(OWN.to_body(e)[[0, 2]])))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("said", "named"), [((0.0, 0.0, 0.0), True), ((0.0, -4.0, 0.0), False), (None, False)]
+)
+def test_a_path_over_a_wall_is_named(said, named):
+    """The path is 20 dB weaker than a line of sight of its length, and the mesh has its wall: the
+    target is found where it is and tracked, without a line of sight. Where the transmitter says to
+    be elsewhere, or says nothing, data alone are read. Planted bugs: any path named; the place of
+    the image taken for the transmitter's; the reference left among what is found as one."""
+    _, schedule, _ = frame(waveform=W)
+    rng = np.random.default_rng(3)
+    free = ANTENNAS.gain * W.wavelength / (4 * np.pi * np.linalg.norm(IMAGE - OWN.position))
+    receivers = Receivers(link_acquisition="blind", symbol_decision="beams")
+    around = Surroundings(city(WALL))
+    terminal = passive_terminal(
+        W, ANTENNAS, receivers, Tracking(), 8, 5.0 / free, None, surroundings=around
+    )
+    for n in range(7):
+        payload = random_payload(W, schedule, 8, rng)
+        received = cube(W, schedule, payload, ways(n), noise=0.1, seed=n)
+        moved = VELOCITY * n * INTERVAL
+        own = Pose(OWN.position + moved, VELOCITY, np.zeros(3), OWN.rotation)
+        place = None if said is None else SENDER + moved + said
+        sender = None if place is None else Pose(place, VELOCITY, np.zeros(3), np.eye(3))
+        heard, tracks = terminal.step(received, own, n * INTERVAL, True, sender=sender)
+    assert heard.decoded and np.array_equal(heard.bits, payload.bits)
+    assert not heard.line_of_sight and terminal.reference.track is None
+    assert heard.placed == named
+    d = heard.detections
+    if not named:
+        assert len(d) == 0 and len(tracks) == 0
+        return
+    assert not d.is_reference.any()
+    echo = ways(6)[1]
+    assert np.abs(d.range - echo.length).min() < 0.1 * W.range_cell(1)
+    # 0.1 cells of range, and a direction known to 0.01 at 10 m
+    off = np.linalg.norm(tracks.mean[tracks.confirmed, :3] + own.position - TARGET - moved, axis=1)
+    assert off.min() < 0.5
+
+
+class Asked(Exception):
+    """What the city shows was asked for."""
+
+
+def _raise(what):
+    raise what
+
+
+@pytest.mark.parametrize("read", [False, True])
+def test_the_city_is_expected_from_where_the_data_say(read):
+    """Once a data frame was read its word counts, and before it the track, 1 m off and 1.2 m/s.
+    Planted bug: the track asked though the data were read."""
+    asked = []
+
+    def clutter(state, own):
+        asked.append(state)
+        raise Asked
+
+    terminal = passive_terminal(
+        W, ANTENNAS, Receivers(), Tracking(), 8, 1.0, surroundings=Surroundings(None, clutter)
+    )
+    told = Pose(SENDER, VELOCITY, np.zeros(3), np.eye(3))
+    off = np.array([1.0, 0.0, 0.0, 0.0, 1.2, 0.0])
+    tracked = Gaussian(np.concatenate([SENDER, VELOCITY]) + off, np.eye(6) * 1e-4)
+    terminal.reference.state = Followed(Track.of_body(tracked), 0.0, read=read)
+    with pytest.raises(Asked):
+        terminal.step(None, OWN, 0.0, True, sender=told)
+    expected = tracked.mean - off * read
+    np.testing.assert_allclose(asked[0], expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("word", "first"), [(False, 2), (True, 5)])
+def test_a_terminal_that_is_told_of_others_waits_for_their_word(word, first, monkeypatch):
+    """A UAV in the open, seen in every frame: alone the terminal confirms it in the third, in a
+    swarm when the active one, that saw it as early, can have told of it. Planted bugs: no wait; a
+    step that does not ask whether data say where the transmitter is."""
+    around = Surroundings(city([[x + 200.0, y, z] for x, y, z in WALL]))
+    tracking = Tracking(births="unexplained")
+    terminal = passive_terminal(W, ANTENNAS, Receivers(), tracking, 8, 1.0, surroundings=around)
+    sender = Track.of_body(Gaussian(np.concatenate([SENDER, VELOCITY]), np.eye(6) * 1e-6))
+    flies = np.concatenate([TARGET, VELOCITY + np.array([1.0, 0.0, 0.0])])
+    z = measure(flies, OWN, sender.state.mean)
+    found = Detections(
+        range=z[:1],
+        velocity=z[1:2],
+        direction=z[None, 2:],
+        snr=np.full(1, 50.0),
+        std=np.array([[0.03, 0.08, 0.005, 0.006]]),
+        is_reference=np.zeros(1, bool),
+        starts=np.ones(1, bool),
+    )
+    confirmed = []
+    own = Own(OWN, 0.0, cooperates=word, reference=sender)
+    for n in range(7):
+        terminal.tracker.predict(1e-6 * n)
+        follow(terminal.tracker, terminal.equipment.rules, found, own)
+        confirmed += [n] * terminal.tracker.tracks[0].confirmed
+    assert confirmed == [*range(first, 7)]
