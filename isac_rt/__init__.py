@@ -68,11 +68,11 @@ if TYPE_CHECKING:
     from isac_rt.track.terminal import PassiveTerminal as PassiveTerminal
     from isac_rt.views.animate import animate as animate
     from isac_rt.views.animate import write_animation as write_animation
-    from isac_rt.views.interactive import scene_3d as scene_3d
     from isac_rt.views.interchange import from_sionna as from_sionna
     from isac_rt.views.interchange import stonesoup_detections as stonesoup_detections
     from isac_rt.views.interchange import write_sigmf as write_sigmf
     from isac_rt.views.plots import Plots as Plots
+    from isac_rt.views.scene import scene_3d as scene_3d
 
 _NAMES = {
     "capture.calibrate": "Calibration calibrate",
@@ -96,7 +96,7 @@ _NAMES = {
     "sweep": "Samples load_dataset load_sweep open_sweep run_dataset run_sweep",
     "track.terminal": "ActiveTerminal PassiveTerminal",
     "views.animate": "animate write_animation",
-    "views.interactive": "scene_3d",
+    "views.scene": "scene_3d",
     "views.interchange": "from_sionna stonesoup_detections write_sigmf",
     "views.plots": "Plots",
 }

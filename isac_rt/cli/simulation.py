@@ -355,7 +355,7 @@ def view(
         times = np.linspace(setup.timetable.epoch(0), setup.timetable.epoch(loaded.frames - 1), 60)
         scene = setup.city, setup.swarm, times, setup.timetable.epoch(frame), found
         if out.suffix == ".html":
-            from isac_rt.views.interactive import scene_3d, write_page
+            from isac_rt.views.scene import scene_3d, write_page
 
             write_page(scene_3d(*scene), out)
         else:

@@ -1,4 +1,4 @@
-"""A run as a moving picture: the map view and a terminal's range-Doppler map in step."""
+"""A run as an animation: the map view and a link's range-Doppler map in step."""
 
 from __future__ import annotations
 
@@ -17,12 +17,15 @@ from isac_rt.results.files import ResultsError
 from isac_rt.results.recorder import Results
 from isac_rt.results.swarm import SWARM
 from isac_rt.storage import write_whole
-from isac_rt.views.figures import STYLE, colour_of, range_doppler, scene_map
+from isac_rt.views.figures import scene_map
+from isac_rt.views.maps import map_limits, range_doppler
+from isac_rt.views.style import STYLE, colour_of
 from isac_rt.world.city.mesh import CityMesh
 
 WRITERS = {".gif": "pillow", ".mp4": "ffmpeg"}
 
-_LEFT, _RIGHT = (0.06, 0.11, 0.38, 0.8), (0.52, 0.11, 0.42, 0.8)
+_LEFT, _RIGHT = (0.06, 0.1, 0.38, 0.72), (0.52, 0.1, 0.42, 0.72)
+"""Places of the axes, below the room for titles and legends."""
 
 
 def tracked_positions(dataset: xr.Dataset, frame: int, observer: int) -> np.ndarray:
@@ -55,12 +58,14 @@ def animate(
             "--snapshots 20 or more"
         )
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(11, 4.8), dpi=100)
+        figure = Figure(figsize=(11, 5.2), dpi=100)
         left, right = figure.add_axes(_LEFT), figure.add_axes(_RIGHT)
         scene_map(left, d, city)
         for line in left.lines:
             line.set_alpha(0.25)
         moving = _Moving(left, d, observer)
+        limits = np.array([map_limits(d, k, observer) for k in shown])
+        low, high = limits[..., 0].min(axis=0), limits[..., 1].max(axis=0)
 
         def draw(k: int) -> list:
             frame = int(d.snapshot_frame.values[k])
@@ -71,6 +76,7 @@ def animate(
             right.set_position(_RIGHT)
             with matplotlib.rc_context(STYLE):
                 range_doppler(right, d, k, observer)
+            right.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
             return []
 
         return figure, FuncAnimation(figure, draw, frames=shown, blit=False, cache_frame_data=False)
@@ -95,16 +101,16 @@ class _Moving:
             mew=1.6,
             label=f"tracks of {dataset.observer.values[observer]}",
         )
-        pictures = {
-            str(dataset.receiver.values[observer]): ("s", 10, "its picture with what it hears"),
-            SWARM: ("D", 14, "picture of the whole swarm"),
+        fused = {
+            str(dataset.receiver.values[observer]): ("s", 10, "its fused tracks"),
+            SWARM: ("D", 14, "fused tracks of the whole swarm"),
         }
         alone = "" if "picture" in dataset.variables else "_"
         self._fused = {
             name: ax.plot([], [], mark, color="black", ms=size, mfc="none", label=alone + words)[0]
-            for name, (mark, size, words) in pictures.items()
+            for name, (mark, size, words) in fused.items()
         }
-        ax.legend(loc="lower right", frameon=True, facecolor="white", edgecolor="none")
+        ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
 
     def show(self, frame: int) -> None:
         position = self._d.uav_position.values
@@ -116,7 +122,9 @@ class _Moving:
         for name, marks in self._fused.items():
             fused = fused_positions(self._d, frame, name)
             marks.set_data(fused[:, 0], fused[:, 1])
-        self._ax.set_title(f"t = {float(self._d.time.values[frame]):.2f} s", loc="left")
+        legend = self._ax.get_legend()
+        assert legend is not None
+        legend.set_title(f"t = {float(self._d.time.values[frame]):.2f} s")
 
 
 def write_animation(

@@ -18,8 +18,9 @@ from matplotlib.colors import to_rgba
 from isac_rt.results.dataset import tracked_states
 from isac_rt.results.recorder import Results
 from isac_rt.storage import write_whole
-from isac_rt.views.figures import KIND_COLOURS, colour_of
 from isac_rt.views.interchange import stonesoup_detections
+from isac_rt.views.scene import path_lines
+from isac_rt.views.style import KIND_COLOURS, colour_of
 from isac_rt.world.city.mesh import CityMesh
 
 if TYPE_CHECKING:
@@ -65,24 +66,25 @@ def table(dataset: xr.Dataset, name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
             meaning = ", ".join([v.attrs["long_name"], *(f"{k}: {word}" for k, word in flags)])
             about.append((name, column, v.attrs["units"], meaning))
     about = [row for row in about if not row[1].endswith(("_frame", "_observer"))]
-    made = pd.DataFrame(columns)
+    flat = xr.Dataset(columns)
+    made = flat.to_dataframe(dim_order=list(rows)).reset_index(drop=len(rows) == 1)
     if len(rows) > 1:
-        where = np.indices([dataset.sizes[dim] for dim in rows]).reshape(len(rows), -1)
-        for k, dim in reversed(list(enumerate(rows))):
-            made.insert(0, dim, dataset[dim].values[where[k]])
-        made.insert(1, "time", dataset.time.values[where[0]])
+        made.insert(1, "time", np.repeat(dataset.time.values, len(made) // dataset.sizes["frame"]))
     else:
         _name_places(made, dataset, rows[0])
     return made, pd.DataFrame(about, columns=["table", "column", "units", "meaning"])
 
 
-def _columns(key: str, v: xr.DataArray, rows: int) -> Iterator[tuple[str, np.ndarray]]:
+def _columns(key: str, v: xr.DataArray, rows: int) -> Iterator[tuple[str, xr.DataArray]]:
     """A variable's components as columns, named by their coordinates or numbers."""
-    labels = [v[dim].values if dim in v.coords else range(v.sizes[dim]) for dim in v.dims[rows:]]
-    values = v.values.reshape(-1, *v.shape[rows:])
+    inside = v.dims[rows:]
     for place in np.ndindex(*v.shape[rows:]):
-        ending = [str(along[i]) for along, i in zip(labels, place, strict=True)]
-        yield "_".join([key, *ending]), values[(slice(None), *place)]
+        part = v[dict(zip(inside, place, strict=True))]
+        labels = [
+            str(part.coords[dim].item() if dim in part.coords else i)
+            for dim, i in zip(inside, place, strict=True)
+        ]
+        yield "_".join([key, *labels]), part.drop_vars(inside, errors="ignore")
 
 
 def _name_places(made: pd.DataFrame, dataset: xr.Dataset, dim: str) -> None:
@@ -186,28 +188,10 @@ def _lines(dataset: xr.Dataset) -> dict[str, tuple[list[np.ndarray], Colour]]:
         if lines := [line for line in lines if len(line) > 1]:
             out[f"tracks of {observer}"] = lines, to_rgba(colour_of(o))
     for k, kind in enumerate(dataset.kind.values):
-        lines = list(path_lines(dataset, np.flatnonzero(dataset.path_kind.values == k)))
+        lines = list(path_lines(dataset, np.flatnonzero(dataset.path_kind.values == k), MOST_PATHS))
         if lines:
             out[f"paths, {kind}"] = lines, to_rgba(KIND_COLOURS[kind])
     return out
-
-
-def path_lines(
-    dataset: xr.Dataset, rows: np.ndarray, most: int = MOST_PATHS
-) -> Iterator[np.ndarray]:
-    """(N, 3) transmitter, points and receiver [m] of the strongest paths among rows of the
-    ledger; leakage has no line."""
-    names, kind = list(dataset.uav.values), dataset.path_kind.values
-    frames, observers = dataset.path_frame.values, dataset.path_observer.values
-    places, along = dataset.uav_position.values, dataset.path_points.values
-    ends = [
-        [names.index(end) for end in dataset[side].values] for side in ("transmitter", "receiver")
-    ]
-    rows = rows[kind[rows] != list(dataset.kind.values).index("leakage")]
-    for k in rows[np.argsort(-dataset.path_power_db.values[rows], kind="stable")][:most]:
-        tx, rx = (places[frames[k], end[observers[k]]] for end in ends)
-        points = along[k]
-        yield np.vstack([tx, points[np.isfinite(points).all(axis=1)], rx])
 
 
 def write_glb(dataset: xr.Dataset, city: CityMesh, file: Path) -> None:

@@ -3,7 +3,6 @@ all."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -17,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import AutoLocator, LogLocator
+from matplotlib.transforms import Bbox
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.results.columns import MEASURES
@@ -24,120 +24,28 @@ from isac_rt.results.dataset import errors_of
 from isac_rt.results.files import write_figure
 from isac_rt.results.recorder import Results
 from isac_rt.results.records import KINDS
+from isac_rt.views.maps import equivalent_range, range_doppler
+from isac_rt.views.style import (
+    KIND_COLOURS,
+    KIND_MARKERS,
+    ROLE_MARKERS,
+    STYLE,
+    colour_of,
+    labelled,
+    link_name,
+    moment,
+    words,
+)
 from isac_rt.world.city.mesh import CityMesh
 
-KIND_COLOURS = {
-    "line_of_sight": "#000000",
-    "target": "#D55E00",
-    "ghost": "#CC79A7",
-    "specular": "#0072B2",
-    "diffuse": "#56B4E9",
-    "leakage": "#E69F00",
-}
-"""One colour per path kind in every figure (Okabe and Ito, Color Universal Design, 2008)."""
-KIND_MARKERS = {
-    "line_of_sight": "s",
-    "target": "o",
-    "ghost": "D",
-    "specular": "^",
-    "diffuse": ".",
-    "leakage": "P",
-}
-UNEXPLAINED = "#8C8C8C"
-UAV_COLOURS = (
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#E69F00",
-    "#56B4E9",
-    "#000000",
-    "#8C6D31",
-)
-ROLE_MARKERS = {"active": "*", "passive": "s", "target": "o"}
-STYLE: dict[Any, Any] = {
-    "figure.dpi": 110,
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#E4E4E4",
-    "grid.linewidth": 0.6,
-    "axes.axisbelow": True,
-    "axes.titlesize": 10,
-    "axes.titlelocation": "left",
-    "axes.titley": 1.0,  # where they are anyway; else all tick labels are measured once more
-    "text.hinting": "none",  # a twelfth of the time of a figure, and letters stand more evenly
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-    "lines.linewidth": 1.4,
-}
-_MARGINS = (0.75, 0.15, 0.5, 0.55, 0.75, 1.0)
-"""Left, right, bottom, top, between columns and between rows of a figure [inch]."""
-_LEGEND_ROW = 0.17
-"""Height of a row of a legend [inch]."""
-_LEGEND_COLUMN = 1.6
-"""Width of a column of a legend [inch]."""
-_SHOWN_DB = 60.0
-"""Depth of a map's colour scale [dB]."""
-_LEAKAGE_CELLS = 3.0
-"""Range cells in which an active terminal's own leakage decides how bright a map is."""
 _STEPS = 5
 """Steps of an axis at most: every tick takes as long to draw as a curve."""
-_TINY = np.finfo(np.float32).tiny  # maps are kept in single precision
 _UNITS = {
     "range": (1.0, "m"),
     "velocity": (1.0, "m/s"),
     "azimuth": (180 / np.pi, "deg"),
     "elevation": (180 / np.pi, "deg"),
 }
-
-
-def words(name: str) -> str:
-    """A name as people read it."""
-    return name.replace("_", " ")
-
-
-def colour_of(index: int) -> str:
-    """The colour of a UAV, an observer or a curve by its number."""
-    return UAV_COLOURS[index % len(UAV_COLOURS)]
-
-
-def _link(dataset: xr.Dataset, observer: int) -> str:
-    return f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]}"
-
-
-def _moment(dataset: xr.Dataset, snapshot: int) -> tuple[int, int]:
-    """Index of a snapshot's frame, and the frame's number."""
-    frame = int(dataset.snapshot_frame.values[snapshot])
-    return frame, int(dataset.frame.values[frame])
-
-
-def _labelled(ax: Axes, x: str, y: str, columns: int = 0, **legend: Any) -> Axes:
-    """Labels, and a legend if there is something to name that no axis before names alike.
-
-    With `columns` it stands above the data, for which the axis grows, in so many columns or as
-    many as its names leave room for.
-    """
-    ax.set(xlabel=x, ylabel=y)
-    figure = ax.get_figure(root=True)
-    assert figure is not None
-    names = ax.get_legend_handles_labels()[1]
-    legends = [other.get_legend() for other in figure.axes]
-    shown = [[text.get_text() for text in old.get_texts()] for old in legends if old]
-    named = 0 if names in shown else len(names)
-    if named and columns:
-        width, height = ax.get_position().size * figure.get_size_inches()
-        letters = 10 + len("".join(names)) / named  # with the line before and the gap behind
-        letter = 0.45 * matplotlib.rcParams["font.size"] / 72
-        columns = max(1, min(columns, int(width / (letter * letters))))
-        share = min(0.6, (math.ceil(named / columns) * _LEGEND_ROW + 0.1) / height)
-        low, high = ax.get_ylim()
-        ax.set_ylim(low, low + (high - low) / (1 - share))
-        legend = {"loc": "upper left", "ncols": columns} | legend
-    if named:
-        ax.legend(**legend)
-    return ax
 
 
 def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Axes:
@@ -148,29 +56,12 @@ def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Ax
     margin = 0.35 * max(*(high - low), 40.0)
     if city is not None and city.num_faces:
         _footprints(ax, city, low - margin, high + margin)
-    for u, name in enumerate(dataset.uav.values):
+    for u in range(dataset.sizes["uav"]):
         x, y = position[:, u, 0], position[:, u, 1]
         role, colour = str(dataset.role.values[u]), colour_of(u)
         ax.plot(x, y, color=colour)
-        ax.plot(
-            x[-1],
-            y[-1],
-            ROLE_MARKERS[role],
-            color=colour,
-            ms=11 if role == "active" else 6,
-            mec="white",
-            mew=0.8,
-        )
-        ax.annotate(
-            f"{name}",
-            (x[-1], y[-1]),
-            xytext=(6, 5),
-            textcoords="offset points",
-            fontsize=9,
-            fontweight="bold",
-            color=colour,
-            bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.7},
-        )
+        size = 11 if role == "active" else 6
+        ax.plot(x[-1], y[-1], ROLE_MARKERS[role], color=colour, ms=size, mec="white", mew=0.8)
         facing = dataset.uav_attitude.values[-1, u, :2, 1]
         if role != "target":
             ax.annotate(
@@ -179,16 +70,53 @@ def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Ax
                 (x[-1], y[-1]),
                 arrowprops={"arrowstyle": "->", "color": colour, "lw": 1},
             )
-    ax.set(
-        xlim=(low[0] - margin, high[0] + margin),
-        ylim=(low[1] - margin, high[1] + margin),
-        xlabel="east [m]",
-        ylabel="north [m]",
-    )
+    for role, marker in ROLE_MARKERS.items():
+        if role in dataset.role.values:
+            label = "target" if role == "target" else f"{role} terminal, boresight"
+            ax.plot([], [], marker, color="#606060", label=label)
+    ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
     ax.set_aspect("equal")
     ax.grid(False)
-    ax.set_title("Swarm (star: active, square: passive, circle: target; arrows: boresight)")
+    labelled(ax, "east [m]", "north [m]")
+    _name(ax, position[-1, :, :2], [str(name) for name in dataset.uav.values])
     return ax
+
+
+_BESIDE = np.array(
+    [(x, y) for r in (1.0, 1.8, 2.6) for x in (r, -r, 0) for y in (r, -r, 0) if x or y]
+)
+"""Places of a name around its marker, the best first [letters]."""
+
+
+def _name(ax: Axes, points: np.ndarray, names: Sequence[str]) -> None:
+    """Write names next to points (N, 2), each where it covers no other name and no marker."""
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    figure.draw_without_rendering()  # the layout decides where the points lie
+    markers = ax.transData.transform(points)
+    letter, taken = matplotlib.rcParams["font.size"] * figure.dpi / 72, list[Bbox]()
+    style = {"fc": "white", "ec": "none", "alpha": 0.7, "boxstyle": "round,pad=0.1"}
+    for u, (name, here) in enumerate(zip(names, markers, strict=True)):
+        size = np.array([0.8 * len(name), 1.2]) * letter
+        corners = here + 0.8 * letter * _BESIDE - size * (1 - np.sign(_BESIDE)) / 2
+        boxes = [Bbox([corner, corner + size]) for corner in corners]
+        free = [
+            box
+            for box in boxes
+            if box.count_overlaps(taken) == 0
+            and not any(box.contains(*marker) for marker in markers)
+            and ax.bbox.x0 <= box.x0 <= box.x1 <= ax.bbox.x1
+        ]
+        taken.append((free or boxes)[0])
+        ax.annotate(
+            name,
+            points[u],
+            xytext=(taken[u].p0 - here) * 72 / figure.dpi,
+            textcoords="offset points",
+            fontweight="bold",
+            color=colour_of(u),
+            bbox=style,
+        )
 
 
 def _footprints(ax: Axes, city: CityMesh, low: np.ndarray, high: np.ndarray) -> None:
@@ -216,142 +144,6 @@ def _footprints(ax: Axes, city: CityMesh, low: np.ndarray, high: np.ndarray) -> 
     ax.add_collection(patches)
 
 
-def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -> Axes:
-    """Range-Doppler map of one terminal; detections marked by the kind of path that explains them,
-    truth as circles."""
-    power = dataset.map_power.values[snapshot, observer]
-    r, v = dataset.map_range.values[observer], dataset.map_velocity.values[observer]
-    rows, columns = np.isfinite(r), np.isfinite(v)
-    level = 10 * np.log10(np.maximum(power[np.ix_(rows, columns)], _TINY))
-    level = level - np.median(level)  # most cells hold noise alone
-    own = dataset.transmitter.values[observer] == dataset.receiver.values[observer]
-    far = r[rows] > _LEAKAGE_CELLS * dataset.attrs["range_cell_m"] * own
-    brightest = level[far].max() if far.any() else level.max()
-    _map(
-        ax,
-        v[columns],
-        r[rows],
-        level,
-        (-5.0, np.clip(brightest, 5.0, _SHOWN_DB)),
-        "power above the median cell [dB]",
-    )
-    if not power.any():
-        ax.text(
-            0.5,
-            0.5,
-            "no map: the data's delays were not known",
-            color="white",
-            ha="center",
-            transform=ax.transAxes,
-        )
-    frame, number = _moment(dataset, snapshot)
-    mine = (dataset.det_frame.values == frame) & (dataset.det_observer.values == observer)
-    kind = dataset.det_kind.values
-    for k, name in [*enumerate(KINDS), (-1, "unexplained")]:
-        at = mine & (kind == k)
-        if at.any():
-            ax.plot(
-                dataset.det_velocity.values[at],
-                dataset.det_range.values[at],
-                KIND_MARKERS.get(name, "x"),
-                ms=6,
-                mew=1.1,
-                ls="none",
-                mfc="none" if k >= 0 else None,
-                color="white" if name == "line_of_sight" else KIND_COLOURS.get(name, UNEXPLAINED),
-                label=f"{words(name)} ({at.sum()})",
-            )
-    x, y = _expected(dataset, frame, observer)
-    ax.plot(
-        x, y, "o", ms=13, mfc="none", mec="white", mew=1.2, ls="none", label="UAV in view (truth)"
-    )
-    far = np.concatenate([dataset.det_range.values[mine], y[np.isfinite(y)], [20.0]])
-    ax.set(xlim=(v[columns].min(), v[columns].max()), ylim=(0, min(1.4 * far.max(), r[rows].max())))
-    ax.set(
-        xlabel="radial velocity [m/s] (receding is positive)",
-        ylabel="range [m]" if own else "path length [m]",
-    )
-    figure = ax.get_figure(root=True)
-    columns = max(1, int((figure.get_figwidth() if figure else 8.0) / _LEGEND_COLUMN))
-    rows_above = math.ceil(len(ax.get_legend_handles_labels()[0]) / columns)
-    ax.set_title(
-        f"{dataset.observer.values[observer]}, frame {number}",
-        pad=6 + 72 * _LEGEND_ROW * rows_above,
-    )
-    ax.legend(
-        loc="lower left",
-        bbox_to_anchor=(0, 1),
-        ncols=columns,
-        borderaxespad=0.2,
-        columnspacing=1.0,
-        frameon=True,
-        facecolor="#303030",
-        edgecolor="none",
-        labelcolor="white",
-    )
-    return ax
-
-
-def _expected(dataset: xr.Dataset, frame: int, observer: int) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity and range at which the map shows the UAVs in view and unshadowed, velocity folded
-    into the map's span."""
-    here = frame, observer
-    seen = dataset.in_view.values[here] & ~dataset.shadowed.values[here]
-    r, v = dataset.truth_range.values[here][seen], dataset.truth_velocity.values[here][seen]
-    axis = dataset.map_velocity.values[observer]
-    axis = axis[np.isfinite(axis)]
-    span = (axis[1] - axis[0]) * len(axis)
-    return v - span * np.floor((v - axis[0]) / span + 0.5 / len(axis)), r
-
-
-def _map(
-    ax: Axes,
-    x: np.ndarray,
-    y: np.ndarray,
-    level_db: np.ndarray,
-    shown: tuple[float, float],
-    label: str,
-) -> None:
-    """A picture of levels whose cells have their middles at `x` and `y`."""
-    dx, dy = ((a[-1] - a[0]) / max(len(a) - 1, 1) / 2 for a in (x, y))
-    image = ax.imshow(
-        level_db,
-        origin="lower",
-        aspect="auto",
-        cmap="magma",
-        vmin=shown[0],
-        vmax=shown[1],
-        interpolation="nearest",
-        extent=(x[0] - dx, x[-1] + dx, y[0] - dy, y[-1] + dy),
-    )
-    ax.figure.colorbar(image, ax=ax, label=label, pad=0.01, fraction=0.12, aspect=30)
-    ax.grid(False)
-
-
-def equivalent_range(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -> Axes:
-    """Range cell over chirp of the first group before the data are removed: what the delay symbols
-    do to every echo."""
-    magnitude = dataset.map_equivalent_range.values[snapshot, observer]
-    magnitude = magnitude[np.isfinite(magnitude).all(axis=1)]
-    level = 20 * np.log10(np.maximum(magnitude, _TINY))
-    level = level - level.max()
-    _map(
-        ax,
-        np.arange(level.shape[1]),
-        np.arange(level.shape[0]),
-        level,
-        (-_SHOWN_DB, 0.0),
-        "magnitude [dB below the peak]",
-    )
-    cells, chirps = np.nonzero(dataset.map_equivalent_detections.values[snapshot, observer])
-    ax.plot(chirps, cells, "o", ms=2.5, mfc="none", mec="white", mew=0.4)
-    ax.set_title(
-        f"{dataset.observer.values[observer]}, frame {_moment(dataset, snapshot)[1]}, "
-        "equivalent range before data removal"
-    )
-    return _labelled(ax, "chirp", "range cell (circles: one-dimensional CFAR)")
-
-
 def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
     """Truth (line), raw detections (dots) and tracks (thick) of every UAV over time; shadowed
     intervals shaded in its colour."""
@@ -372,10 +164,17 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
         ax.plot(t, here(f"detected_{name}")[:, u] * scale, ".", color=colour, ms=4, alpha=0.7)
         ax.plot(t, here(f"tracked_{name}")[:, u] * scale, color=colour, lw=3, alpha=0.45)
         _shade(ax, t, here("shadowed")[:, u] & seen, colour)
-    if name == "range":
-        forms = "truth (line), detections (dots), tracks (broad), hidden (shaded)"
-        ax.set_title(f"{dataset.observer.values[observer]}: {forms}")
-    return _labelled(ax, "time [s]", f"{name} [{unit}]", columns=8)
+    forms: dict[str, dict[str, Any]] = {
+        "truth": {"lw": 0.9},
+        "detection": {"marker": ".", "ls": "none"},
+        "track": {"lw": 3, "alpha": 0.45},
+    }
+    if (here("shadowed") & here("in_view")).any():
+        forms["occluded"] = {"marker": "s", "ms": 7, "mew": 0, "ls": "none", "alpha": 0.2}
+    for label, style in forms.items():
+        ax.plot([], [], color="#606060", label=label, **style)
+    title = link_name(dataset, observer) if name == "range" else ""
+    return labelled(ax, "time [s]", f"{name} [{unit}]", title)
 
 
 def _processed(dataset: xr.Dataset, observer: int) -> Callable[[str], np.ndarray]:
@@ -421,7 +220,7 @@ def error_cdf(ax: Axes, dataset: xr.Dataset, name: str, terminals: bool = False)
     ax.xaxis.set_major_locator(LogLocator(numticks=_STEPS))
     ax.minorticks_off()  # they take longer to draw than the curves
     ax.xaxis.set_major_formatter("{x:g}")  # powers of ten are set as formulas
-    return _labelled(ax, f"|{name} error| [{unit}]", "share of errors below", columns=2)
+    return labelled(ax, f"|{name} error| [{unit}]", "share of errors below")
 
 
 def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Axes:
@@ -448,9 +247,9 @@ def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Ax
                 mew=0,
                 label=f"{words(name)} ({at.sum()})",
             )
-    delay, doppler = "path length [m]", "Doppler shift [kHz] (closing is positive)"
-    ax.set_title(_link(dataset, observer))
-    _labelled(ax, delay if against == "delay" else doppler, "path gain [dB]", columns=3)
+    delay, doppler = "path length [m]", "Doppler shift [kHz]"
+    axis = delay if against == "delay" else doppler
+    labelled(ax, axis, "path gain [dB]", link_name(dataset, observer))
     legend = ax.get_legend()
     for handle in legend.legend_handles if legend else ():
         assert handle is not None
@@ -480,20 +279,17 @@ def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
         )
     data = total[:, 0] > 0
     lost = data & ~dataset.decoded.values[:, observer]
-    ax.plot(
-        t[lost],
-        np.full(lost.sum(), 1.06),
-        "x",
-        color="#303030",
-        ms=4,
-        label=f"not decided ({lost.sum()} of {data.sum()} data frames)",
-    )
+    if lost.any():
+        label = f"not decided ({lost.sum()} of {data.sum()} frames)"
+        ax.plot(t[lost], np.full(lost.sum(), 1.06), "x", color="#303030", ms=4, label=label)
     sender = list(dataset.uav.values).index(dataset.transmitter.values[observer])
-    _shade(ax, t, dataset.shadowed.values[:, observer, sender], "#303030")
+    hidden = dataset.shadowed.values[:, observer, sender]
+    _shade(ax, t, hidden, "#303030")
+    if hidden.any():
+        label = f"{dataset.transmitter.values[observer]} occluded"
+        ax.plot([], [], "s", color="#303030", alpha=0.2, ms=7, mew=0, label=label)
     ax.set(ylim=(-0.04, 1.14), yticks=(0, 0.5, 1))
-    hidden = dataset.transmitter.values[observer]
-    ax.set_title(f"{dataset.observer.values[observer]} (shaded: the city hides {hidden})")
-    return _labelled(ax, "time [s]", "symbol error rate", columns=3)
+    return labelled(ax, "time [s]", "symbol error rate", link_name(dataset, observer))
 
 
 def reference_snr(ax: Axes, dataset: xr.Dataset) -> Axes:
@@ -511,7 +307,7 @@ def reference_snr(ax: Axes, dataset: xr.Dataset) -> Axes:
             color=colour_of(o),
             label=name,
         )
-    return _labelled(ax, "time [s]", "SNR of the reference path [dB]", columns=8)
+    return labelled(ax, "time [s]", "SNR [dB]", "Reference path")
 
 
 def path_counts(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
@@ -531,8 +327,7 @@ def path_counts(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
                 color=KIND_COLOURS[name],
                 label=f"{words(name)} ({count[:, k].sum()})",
             )
-    ax.set_title(f"{_link(dataset, observer)} (paths over all frames)")
-    return _labelled(ax, "time [s]", "path gain of the kind [dB]", columns=6)
+    return labelled(ax, "time [s]", "path gain [dB]", f"{link_name(dataset, observer)}, by kind")
 
 
 @dataclass(frozen=True)
@@ -581,27 +376,12 @@ class Drawing(NamedTuple):
 
 
 def _figure(drawing: Drawing, style: Style) -> Figure:
-    """The figure, row by row.
-
-    It is outside pyplot, so that none stays open. Margins are fixed in inches: a layout solver
-    would draw everything twice.
-    """
+    """The figure, row by row; outside pyplot, so that none stays open."""
     columns = min(drawing.columns, style.columns)
     rows = len(drawing.axes) // columns
-    width, height = style.width, drawing.height * style.height * rows
-    figure = Figure(figsize=(width, height))
+    size = style.width, drawing.height * style.height * rows
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=drawing.one_x, sharey="row")
-    left, right, bottom, top, across, down = np.multiply(_MARGINS, style.height**0.5)
-    if drawing.one_x:
-        down = top
-    figure.subplots_adjust(
-        left=left / width,
-        right=1 - right / width,
-        bottom=bottom / height,
-        top=1 - top / height,
-        wspace=across / ((width - left - right - (columns - 1) * across) / columns),
-        hspace=down / ((height - bottom - top - (rows - 1) * down) / rows),
-    )
     for ax, drawn in zip(axes.flat, drawing.axes, strict=True):
         drawn(ax)
         for axis in (ax.xaxis, ax.yaxis):
@@ -625,7 +405,7 @@ def _maps(
     shown = np.flatnonzero(np.isfinite(values[snapshot]).any(axis=(1, 2)))
     draw = [partial(function, dataset=d, snapshot=snapshot, observer=o) for o in shown]
     if draw:
-        yield Drawing(f"{name}_{_moment(d, snapshot)[1]:04d}", draw, height)
+        yield Drawing(f"{name}_{moment(d, snapshot)[1]:04d}", draw, height)
 
 
 def _all(d: xr.Dataset, city: CityMesh | None, every: bool) -> Iterator[Drawing]:
@@ -742,9 +522,7 @@ def sweep_curves(
     if values[against].dtype == object:
         ax.set_xticks(x, [str(v) for v in values[against].values])
     kept = ", ".join(f"{d} {values[d].values}" for d in rest)
-    ax.set_title(f"{words(quantity)} against {against}" + (f" ({kept})" if kept else ""))
-    about = dataset.attrs[f"axis_{against}"]
-    return _labelled(ax, f"{against} ({about})", words(quantity), loc="best")
+    return labelled(ax, f"{against} ({dataset.attrs[f'axis_{against}']})", words(quantity), kept)
 
 
 def make_sweep_figures(

@@ -7,6 +7,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from isac_rt.views.maps import draw_map
+
 SHOWN_DB = 50.0
 """Below the strongest cell."""
 
@@ -29,17 +31,8 @@ def picture(
     level = 10 * np.log10(np.maximum(values.values, 1e-30))
     level -= np.median(level)
     y, x = values[rows].values, values[columns].values
-    half_x, half_y = (float(a[-1] - a[0]) / max(len(a) - 1, 1) / 2 for a in (x, y))
-    image = ax.imshow(
-        level,
-        origin="lower",
-        aspect="auto",
-        cmap="magma",
-        interpolation="nearest",
-        vmin=level.max() - SHOWN_DB if lowest is None else lowest,
-        extent=(x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y),
-    )
-    ax.figure.colorbar(image, ax=ax, label="power over the median cell [dB]")
+    low = level.max() - SHOWN_DB if lowest is None else lowest
+    draw_map(ax, x, y, level, (low, level.max()), "power over median [dB]")
     if detections is not None:
         across = detections[f"det_{str(columns).removeprefix('map_')}"]
         ax.plot(across, detections.det_range, "o", mfc="none", mec="white", ms=7)

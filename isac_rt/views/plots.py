@@ -9,7 +9,7 @@ import numpy as np
 
 from isac_rt.results.files import ResultsError, open_results
 from isac_rt.results.recorder import Results
-from isac_rt.views import figures
+from isac_rt.views import figures, maps
 from isac_rt.world.city.mesh import CityMesh
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class Plots:
     ) -> Axes:
         """Map of a terminal (by default the first) in one of the kept frames (the last)."""
         kept = self._snapshot(snapshot)
-        return figures.range_doppler(_axes(ax), self.results.dataset, kept, self._number(observer))
+        return maps.range_doppler(_axes(ax), self.results.dataset, kept, self._number(observer))
 
     def tracks(
         self, observer: str | None = None, measure: Measure = "range", ax: Axes | None = None

@@ -22,7 +22,8 @@ from isac_rt.kernels import views_raster
 from isac_rt.kernels.jit import twin_of
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.results.files import write_figure
-from isac_rt.views.figures import KIND_COLOURS, ROLE_MARKERS, colour_of, words
+from isac_rt.views.scene import strongest
+from isac_rt.views.style import KIND_COLOURS, ROLE_MARKERS, colour_of, words
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.passage import hits
 from isac_rt.world.swarm import Pose, Swarm
@@ -37,7 +38,7 @@ FAR_DOWN_M = 1e4
 """The ground is looked for so far below."""
 Below = Callable[[np.ndarray], float]
 _SUPERSAMPLING = 2
-_LINES_PER_KIND = 40
+_LINES_PER_KIND = 80
 _HIDDEN_ALPHA = 0.18
 _PIECES = 48
 
@@ -225,19 +226,19 @@ class _Picture:
         count = dict.fromkeys(PathKind, 0)
         for kind in sorted(PathKind, reverse=True):  # straight paths last, over the many others
             colour = KIND_COLOURS[kind.name.lower()]
-            for p in paths.values():
-                which = np.flatnonzero(p.kind == kind)
-                count[kind] += which.size
-                if kind == PathKind.DIFFUSE and which.size:
-                    points = p.points[which].reshape(-1, 3)
-                    points = points[np.isfinite(points).all(axis=1)]
-                    points = points[~is_hidden(points, self.view, self.depth)]
-                    x, y = self.view.project(points)[:, :2].T
-                    self.ax.plot(x, y, ".", color=colour, ms=2.6, alpha=0.8, mew=0)
-                elif kind != PathKind.LEAKAGE:
-                    width = 1.8 if kind in (PathKind.LINE_OF_SIGHT, PathKind.TARGET) else 1.0
-                    for k in which[np.argsort(-p.power[which], kind="stable")][:_LINES_PER_KIND]:
-                        self.line(polyline(p, k, poses), colour, width, 0.85)
+            lines, count[kind] = strongest(paths, kind, poses, _LINES_PER_KIND)
+            if kind == PathKind.DIFFUSE and lines:
+                points = np.concatenate(
+                    [p.points[p.kind == kind].reshape(-1, 3) for p in paths.values()]
+                )
+                points = points[np.isfinite(points).all(axis=1)]
+                points = points[~is_hidden(points, self.view, self.depth)]
+                x, y = self.view.project(points)[:, :2].T
+                self.ax.plot(x, y, ".", color=colour, ms=2.6, alpha=0.8, mew=0)
+            elif kind != PathKind.LEAKAGE:
+                width = 1.8 if kind in (PathKind.LINE_OF_SIGHT, PathKind.TARGET) else 1.0
+                for line in lines:
+                    self.line(line, colour, width, 0.85)
         return [
             Line2D([], [], color=KIND_COLOURS[name], label=f"{words(name)} ({count[kind]})")
             for kind in PathKind
@@ -272,14 +273,6 @@ class _Picture:
             label = f"{name}, {uav.role}"
             legend.append(Line2D([], [], color=colour, marker=marker, ls="none", label=label))
         return legend
-
-
-def polyline(p: PathSet, k: int, poses: Mapping[str, Pose]) -> np.ndarray:
-    """Corners of a path from transmitter to receiver, its UAV included."""
-    inner = p.points[k][np.isfinite(p.points[k]).all(axis=1)]
-    if not inner.size and p.target[k] >= 0:
-        inner = poses[p.target_names[p.target[k]]].position[None]
-    return np.vstack([poses[p.tx].position, inner, poses[p.rx].position])
 
 
 def view_scene(

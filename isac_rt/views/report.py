@@ -14,7 +14,7 @@ import xarray as xr
 from isac_rt.results.recorder import Results
 from isac_rt.runtime import MissingPackage
 from isac_rt.storage import write_whole
-from isac_rt.views.moving_scene import MOST_LINES, moving_scene, page_part
+from isac_rt.views.scene import MOST_LINES, moving_scene, page_part
 from isac_rt.views.tables import (
     DASH,
     Table,

@@ -25,7 +25,7 @@ from isac_rt.track.filter import Gaussian, measure
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import Track, track_set
 from isac_rt.views.animate import animate
-from isac_rt.views.moving_scene import moving_scene
+from isac_rt.views.scene import moving_scene
 from isac_rt.views.tables import swarm_table
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose

@@ -14,7 +14,7 @@ from fake_run import fake_run
 from isac_rt.cli.cli import main
 from isac_rt.results.files import save
 from isac_rt.views import export
-from isac_rt.views.moving_scene import moving_scene, page_part
+from isac_rt.views.scene import moving_scene, page_part
 from isac_rt.world.city.mesh import CityMesh
 
 

@@ -3,29 +3,30 @@
 from __future__ import annotations
 
 import base64
+import io
 import os
 import re
 import subprocess
 import sys
+from functools import partial
 
+import matplotlib
 import numpy as np
 import pytest
+import xarray as xr
 from fake_run import fake_run
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
 
 from isac_rt.cli.cli import main
 from isac_rt.results.files import save
 from isac_rt.results.records import KINDS
 from isac_rt.views import figures
-from isac_rt.views.figures import (
-    KIND_COLOURS,
-    error_cdf,
-    make_figures,
-    over_time,
-    range_doppler,
-    scene_map,
-)
+from isac_rt.views.figures import error_cdf, make_figures, over_time, scene_map
+from isac_rt.views.maps import map_limits, range_doppler
+from isac_rt.views.style import KIND_COLOURS, STYLE
 
 INK_VARIANCE = 1e-3
 """Variance of pixels in [0, 1]: an empty framed axis has about 1e-4, one line more than this."""
@@ -97,7 +98,7 @@ def test_range_doppler_marks_detections_and_truth_where_they_are(run):
     with axes exchanged and with an empty map."""
     ax = range_doppler(Figure().subplots(), run.dataset, 0, 0)
     lines = {line.get_label(): line for line in ax.get_lines()}
-    truth = lines["UAV in view (truth)"]
+    truth = lines["UAV (truth)"]
     assert (
         truth.get_ydata()[0] == run.dataset.truth_range.values[2, 0, 2]
         and truth.get_xdata()[0] == run.dataset.truth_velocity.values[2, 0, 2]
@@ -119,7 +120,7 @@ def test_truth_beyond_the_unambiguous_velocity_is_drawn_where_it_folds_to(run):
     span = 120 * (axis[1] - axis[0])
     fast.truth_velocity.values[2, 0, 2] = 1.25 * span + 0.1234
     ax = range_doppler(Figure().subplots(), fast, 0, 0)
-    truth = next(line for line in ax.get_lines() if line.get_label() == "UAV in view (truth)")
+    truth = next(line for line in ax.get_lines() if line.get_label() == "UAV (truth)")
     assert abs(truth.get_xdata()[0] - (0.25 * span + 0.1234)) < 1e-9
 
 
@@ -208,18 +209,86 @@ def test_figures_for_a_paper(run, tmp_path, form, capsys):
     assert "choose from screen, wide, column" in capsys.readouterr().err
 
 
-def test_leakage_does_not_set_the_scale_of_a_map(run):
-    """An active terminal's leakage, 50 dB over everything else in its first cells, leaves the scale
-    as it was; a target as strong farther out does not. Planted bug: the peak of the whole map."""
+def test_a_map_shows_a_target_beside_a_line_of_sight_and_is_cut_to_what_is_there(run):
+    """A path of 60 dB saturates and leaves the colours of one of 15 dB as they were; a cell far out
+    widens the map. Planted bugs: the scale of the strongest cell; limits of the whole map; false
+    alarms kept in the map."""
     d = run.dataset.copy(deep=True)
     at = list(d.observer.values).index("AT")
     before = range_doppler(Figure().subplots(), d, 0, at).images[0].get_clim()
+    (_, high), _ = map_limits(d, 0, at)
+    velocity = d.map_velocity.values[at]
+    assert high < np.nanmax(velocity) and before == (0, 35)
     power = d.map_power.values[0, at]
-    power[0, 0] = 1e5 * np.nanmax(power)
-    after = range_doppler(Figure().subplots(), d, 0, at).images[0].get_clim()
-    assert after == pytest.approx(before, abs=0.1)  # the median of the cells moves by one
-    power[np.isfinite(d.map_range.values[at]).sum() - 1, 0] = power[0, 0]
-    assert range_doppler(Figure().subplots(), d, 0, at).images[0].get_clim()[1] > before[1] + 10
+    power[3, np.isfinite(velocity).sum() - 1] = 1e6 * np.nanmedian(power)
+    assert range_doppler(Figure().subplots(), d, 0, at).images[0].get_clim() == before
+    (_, high), (low, _) = map_limits(d, 0, at)
+    assert high == np.nanmax(velocity) and low < d.map_range.values[at, 3]
+    power[:] = 0
+    assert map_limits(d, 0, at)[0] == (np.nanmin(velocity), high)
+
+
+def drawn_texts(figure: Figure) -> list[tuple[str, Bbox]]:
+    """Every text that is drawn, and its box [pixels]."""
+    drawn, draw = {}, Text.draw
+
+    def record(text, renderer, *rest, **more):
+        if (
+            text.get_text() and text.get_visible()
+        ):  # the layout draws before, elsewhere: the last time counts
+            drawn[id(text)] = text.get_text(), text.get_window_extent(renderer)
+        return draw(text, renderer, *rest, **more)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Text, "draw", record)
+        figure.savefig(io.BytesIO(), format="png", dpi=figure.dpi)
+    return list(drawn.values())
+
+
+def complaints(figure: Figure) -> list[str]:
+    """Texts that are cut off, and those that cover another by more than two pixels."""
+    whole, out = figure.bbox.padded(1.0), []
+    boxes = [(text, box.padded(-1.0)) for text, box in drawn_texts(figure)]
+    for k, (text, box) in enumerate(boxes):
+        if not all(whole.contains(*corner) for corner in box.corners()):
+            out.append(f"{text!r} is cut off")
+        out += [f"{text!r} covers {other!r}" for other, seen in boxes[:k] if box.overlaps(seen)]
+    return out
+
+
+@pytest.mark.parametrize("style", figures.STYLES)
+def test_no_text_covers_another_or_is_cut_off(run, style):
+    """Planted bugs: a title of a hundred letters; titles over a legend; an axis's label longer than
+    the axis."""
+    with matplotlib.rc_context(STYLE | {**figures.STYLES[style].settings}):
+        for drawing in figures._all(run.dataset, None, False):
+            figure = figures._figure(drawing, figures.STYLES[style])
+            assert not complaints(figure), drawing.name
+
+
+def test_names_of_a_dense_swarm_cover_each_other_nowhere():
+    """Nine UAVs within a few metres of each other, and one far off. Planted bug: every name to the
+    right of its marker."""
+    rng = np.random.default_rng(5)
+    place = np.vstack([rng.normal(0, 6, (9, 3)), [[90.0, 70.0, 9.0]]])
+    names = ["AT", *(f"PT{k}" for k in range(1, 4)), *(f"U{k}" for k in range(1, 7))]
+    dataset = xr.Dataset(
+        {
+            "uav_position": (("frame", "uav", "axis"), place[None]),
+            "uav_attitude": (
+                ("frame", "uav", "axis", "body_axis"),
+                np.tile(np.eye(3), (1, 10, 1, 1)),
+            ),
+            "role": ("uav", ["active", *["passive"] * 3, *["target"] * 6]),
+        },
+        {"uav": names},
+    )
+    for style in figures.STYLES.values():
+        with matplotlib.rc_context(STYLE | {**style.settings}):
+            drawing = figures.Drawing("scene", [partial(scene_map, dataset=dataset)], 6.4)
+            figure = figures._figure(drawing, style)
+            assert not complaints(figure)
+            assert {text for text, _ in drawn_texts(figure)} >= set(names)
 
 
 def test_figures_and_report_load_no_dask(tmp_path):

@@ -1,5 +1,5 @@
-"""The scene of a finished run to turn about, with a slider through its frames: where the UAVs were,
-where the terminals' tracks stood, and the strongest paths of the frame whose ledger is nearest.
+"""The 3-D scene: city, flights and paths of a frame, or a finished run with a slider through its
+frames, its tracks and the paths of the frame whose ledger is nearest.
 
 It is made as plain mappings, for plotly's own objects take longer to build than the page.
 """
@@ -7,25 +7,34 @@ It is made as plain mappings, for plotly's own objects take longer to build than
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
+from isac_rt.frame.link import Link
+from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.results.dataset import fused_positions, tracked_states
 from isac_rt.results.swarm import SWARM
 from isac_rt.runtime import needed
-from isac_rt.views.export import path_lines
-from isac_rt.views.figures import KIND_COLOURS, colour_of, words
+from isac_rt.storage import write_whole
+from isac_rt.views.style import KIND_COLOURS, colour_of, words
 from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.swarm import Pose, Swarm
+
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
 
 Trace = dict[str, Any]
 MOST_STEPS = 120
 """Positions of the slider; of longer runs frames are left out evenly."""
 MOST_LINES = 15
-"""Paths of a kind that are drawn at a time, the strongest."""
+"""Paths of a kind that are drawn at a time of a run, the strongest."""
+_MOST_OF_A_FRAME = 400
+"""Paths of a kind that are drawn of a single frame, the strongest."""
 CREASE = np.deg2rad(20.0)
 """Faces that meet at more than this have an edge drawn between them [rad]."""
 ROLE_SYMBOLS = {"active": "diamond", "passive": "square", "target": "circle"}
@@ -97,7 +106,7 @@ def city_traces(city: CityMesh, low: np.ndarray, high: np.ndarray) -> list[Trace
         "colorscale": [[0, "#E4E2DC"], [1, "#8E9AA6"]],
         "showscale": False,
         "flatshading": True,
-        "opacity": 0.85,
+        "opacity": 0.5,  # paths and flights stay visible behind walls
         "lighting": {"ambient": 0.6, "diffuse": 0.7, "specular": 0.05},
     }
     return [
@@ -115,6 +124,123 @@ def _line(where: Mapping[str, Any], colour: str, width: float, name: str, **more
     return {**kind, "line": line, **where, **more}
 
 
+def _uavs(names: Sequence[str], roles: Sequence[str], places: np.ndarray) -> Trace:
+    """Named markers of UAVs at places (U, 3) [m]."""
+    marker = {
+        "size": 6,
+        "color": [colour_of(u) for u in range(len(names))],
+        "symbol": [ROLE_SYMBOLS[role] for role in roles],
+    }
+    kind = {"type": "scatter3d", "mode": "markers+text", "name": "UAVs"}
+    return {**kind, "text": list(names), "marker": marker, **points_of(places)}
+
+
+def _fixed(
+    city: CityMesh, names: Sequence[str], flights: np.ndarray, reach: float
+) -> tuple[list[Trace], dict[str, Any]]:
+    """The traces of the city and of flights (T, U, 3) [m], and the layout around them."""
+    low, high = flights[..., :2].min((0, 1)) - reach, flights[..., :2].max((0, 1)) + reach
+    traces = city_traces(city, low, high) + [
+        _line(points_of(flights[:, u]), colour_of(u), 4, f"{name}, flight", showlegend=False)
+        for u, name in enumerate(names)
+    ]
+    return traces, layout(low, high)
+
+
+def polyline(p: PathSet, k: int, poses: Mapping[str, Pose]) -> np.ndarray:
+    """Corners of a path from transmitter to receiver, its UAV included."""
+    inner = p.points[k][np.isfinite(p.points[k]).all(axis=1)]
+    if not inner.size and p.target[k] >= 0:
+        inner = poses[p.target_names[p.target[k]]].position[None]
+    return np.vstack([poses[p.tx].position, inner, poses[p.rx].position])
+
+
+def strongest(
+    paths: Mapping[Link, PathSet], kind: PathKind, poses: Mapping[str, Pose], most: int
+) -> tuple[list[np.ndarray], int]:
+    """The strongest paths of a kind over all links as polylines, and how many there are in all."""
+    every = [
+        (-float(p.power[k]), p, int(k))
+        for p in paths.values()
+        for k in np.flatnonzero(p.kind == kind)
+    ]
+    drawn = sorted(every, key=lambda row: row[0])[:most]
+    return [polyline(p, k, poses) for _, p, k in drawn], len(every)
+
+
+def path_lines(dataset: xr.Dataset, rows: np.ndarray, most: int) -> Iterator[np.ndarray]:
+    """(N, 3) transmitter, points and receiver [m] of the strongest paths among rows of the
+    ledger; leakage has no line."""
+    names, kind = list(dataset.uav.values), dataset.path_kind.values
+    frames, observers = dataset.path_frame.values, dataset.path_observer.values
+    places, along = dataset.uav_position.values, dataset.path_points.values
+    ends = [
+        [names.index(end) for end in dataset[side].values] for side in ("transmitter", "receiver")
+    ]
+    rows = rows[kind[rows] != list(dataset.kind.values).index("leakage")]
+    for k in rows[np.argsort(-dataset.path_power_db.values[rows], kind="stable")][:most]:
+        tx, rx = (places[frames[k], end[observers[k]]] for end in ends)
+        points = along[k]
+        yield np.vstack([tx, points[np.isfinite(points).all(axis=1)], rx])
+
+
+def scene_3d(
+    city: CityMesh,
+    swarm: Swarm,
+    times: np.ndarray,
+    time: float,
+    paths: Mapping[Link, PathSet],
+    reach: float = 150.0,
+) -> Figure:
+    """The scene as a Plotly figure; kinds of path can be switched off in its legend.
+
+    Parameters
+    ----------
+    times : along which flights are drawn [s]
+    time : of the swarm and the paths [s]
+    reach : how far beyond the swarm the city is drawn [m]
+
+    Raises
+    ------
+    isac_rt.runtime.MissingPackage  Without the package `plotly`.
+
+    Examples
+    --------
+    >>> import isac_rt as irt
+    >>> setup = irt.prepare(irt.load("scenes/paper_swarm_consistent.yaml"))
+    >>> frame, when = setup.frame(0), setup.timetable.epoch(0)
+    >>> figure = irt.scene_3d(
+    ...     setup.city, setup.swarm, np.linspace(0, 1, 5), when, frame.paths
+    ... )
+    >>> len(figure.data) > len(setup.swarm.uavs)
+    True
+    """
+    go = needed("plotly.graph_objects", "views")  # takes long to load
+    names, poses = list(swarm.uavs), swarm.poses(time)
+    flights = np.array([[pose.position for pose in swarm.poses(t).values()] for t in times])
+    traces, around = _fixed(city, names, flights, reach)
+    for kind in PathKind:
+        lines, count = strongest(paths, kind, poses, _MOST_OF_A_FRAME)
+        if count and kind != PathKind.LEAKAGE:
+            name = kind.name.lower()
+            shown = {"visible": "legendonly"} if kind == PathKind.DIFFUSE else {}
+            label = f"{words(name)} ({count})"
+            traces.append(_line(lines_of(lines), KIND_COLOURS[name], 3, label, **shown))
+    roles = [uav.role for uav in swarm.uavs.values()]
+    traces.append(_uavs(names, roles, np.array([poses[name].position for name in names])))
+    return go.Figure(traces, around)
+
+
+def write_page(figure: Figure, file: str | Path) -> None:
+    """Write a Plotly figure as one HTML page that needs no network; it appears whole or not at all.
+
+    Raises
+    ------
+    isac_rt.storage.StorageError  If the file cannot be written.
+    """
+    write_whole(file, figure.to_html(include_plotlyjs=True, full_html=True))
+
+
 def moving_scene(dataset: xr.Dataset, city: CityMesh, reach: float = 120.0) -> dict[str, Any]:
     """The scene as plotly's figure: data, layout and a frame for each position of the slider.
 
@@ -122,33 +248,28 @@ def moving_scene(dataset: xr.Dataset, city: CityMesh, reach: float = 120.0) -> d
     ----------
     reach : how far beyond the swarm the city is drawn [m]
     """
-    position = dataset.uav_position.values
-    low, high = position[..., :2].min((0, 1)) - reach, position[..., :2].max((0, 1)) + reach
-    fixed = city_traces(city, low, high)
-    fixed += [
-        _line(points_of(position[:, u]), colour_of(u), 4, f"{name}, flight", showlegend=False)
-        for u, name in enumerate(dataset.uav.values)
-    ]
+    names = [str(name) for name in dataset.uav.values]
+    fixed, around = _fixed(city, names, dataset.uav_position.values, reach)
     count = dataset.sizes["frame"]
     steps = np.unique(np.linspace(0, max(count - 1, 0), min(count, MOST_STEPS)).round().astype(int))
     moving = _Moving(dataset)
     frames = [moving.at(int(f)) for f in steps]
     places = list(range(len(fixed), len(fixed) + len(moving.names)))
-    names = [str(int(dataset.frame.values[f])) for f in steps]
+    numbers = [str(int(dataset.frame.values[f])) for f in steps]
     start = frames[0] if frames else []
     return {
         "data": fixed + start,
-        "layout": layout(low, high) | (_controls(dataset, steps, names) if len(steps) > 1 else {}),
+        "layout": around | (_controls(dataset, steps, numbers) if len(steps) > 1 else {}),
         "frames": [
             {"name": name, "data": data, "traces": places}
-            for name, data in zip(names, frames, strict=True)
+            for name, data in zip(numbers, frames, strict=True)
         ],
     }
 
 
 class _Moving:
-    """The traces that change from frame to frame: UAVs, tracks of each observer, what terminals
-    that cooperate know together, paths by kind."""
+    """The traces that change from frame to frame: UAVs, tracks of each observer, fused tracks of
+    cooperating terminals, paths by kind."""
 
     def __init__(self, dataset: xr.Dataset) -> None:
         self._d = dataset[[str(name) for name in dataset.variables if name in _SHOWN]]
@@ -162,7 +283,7 @@ class _Moving:
         self.names = [
             "UAVs",
             *(f"tracks of {observer}" for observer in dataset.observer.values),
-            *(f"picture of {'the ' * (name == SWARM)}{name}" for name in self._pictures),
+            *(f"fused tracks of {'the ' * (name == SWARM)}{name}" for name in self._pictures),
             *(f"{words(kinds[k])} paths" for k in self._kinds),
         ]
         self._paths = {int(kept): self._paths_of(dataset, int(kept)) for kept in self._kept}
@@ -171,17 +292,7 @@ class _Moving:
         """The traces in a frame."""
         d = self._d
         mark = {"type": "scatter3d", "mode": "markers"}
-        uavs = {
-            "type": "scatter3d",
-            "mode": "markers+text",
-            "text": d.uav.values.tolist(),
-            "marker": {
-                "size": 6,
-                "color": [colour_of(u) for u in range(d.sizes["uav"])],
-                "symbol": [ROLE_SYMBOLS[role] for role in d.role.values],
-            },
-            **points_of(d.uav_position.values[frame]),
-        }
+        uavs = _uavs(d.uav.values.tolist(), d.role.values.tolist(), d.uav_position.values[frame])
         tracks = [
             {
                 **mark,
