@@ -231,7 +231,7 @@ def _numpy(file: Path, d: Description) -> Capture:
 
 
 def _sigmf(file: Path, d: Description) -> Capture:
-    base = file.with_suffix("") if file.suffix in (".sigmf-meta", ".sigmf-data") else file
+    base = _without_end(file)
     meta, data = (base.with_name(base.name + end) for end in (".sigmf-meta", ".sigmf-data"))
     try:
         info = json.loads(_read(meta, MOST_META_BYTES))["global"]
@@ -296,14 +296,20 @@ def _is_finite(value: Any) -> bool:
         return False
 
 
+def _without_end(file: Path) -> Path:
+    """The name that both files of a SigMF recording share."""
+    return file.with_suffix("") if file.suffix in (".sigmf-meta", ".sigmf-data") else file
+
+
 def read_sigmf(file: str | Path) -> IFCube:
-    """An IF cube from a recording that `write_sigmf` made; `file` without the suffix.
+    """An IF cube from a recording that `write_sigmf` made; `file` is either of its files, or their
+    name without the suffix.
 
     Raises
     ------
     ResultsError  If it is none, or its data are not those of its checksum.
     """
-    base = Path(file)
+    base = _without_end(Path(file))
     try:
         meta = read_whole(base.with_name(base.name + ".sigmf-meta"), MOST_META_BYTES)
         data = read_whole(base.with_name(base.name + ".sigmf-data"))

@@ -112,6 +112,7 @@ class Work:
         (`isac_rt.hardware.sweep.short_read`); None: they are not
     reads, first : (T, N) weights with which samples are read farther away; the first of the
         neighbours (`isac_rt.hardware.sweep.read_at`); None: they are not
+    margin : samples that a chirp has besides, before and behind, for those that are read there
     turns : of each chirp; by its `beat` samples are turned back before they are read, their band to
         the middle
     elements : (L_rx, N) complex64, factors of each element's samples; None: 1
@@ -127,6 +128,7 @@ class Work:
     shift: np.ndarray | None = None
     reads: np.ndarray | None = None
     first: int = 0
+    margin: int = 0
     elements: np.ndarray | None = None
     noise: WhiteNoise = SILENCE
     saturation: float = 0.0
@@ -137,9 +139,12 @@ class Work:
     most: float = 0.0
 
 
-def finish(samples: np.ndarray, work: Work) -> None:
-    """Do to samples (M, L_rx, P, N) complex64, in place, what hardware does behind antennas."""
+def finish(samples: np.ndarray, work: Work) -> np.ndarray:
+    """Do to samples (M, L_rx, P, margin + N + margin) complex64 what hardware does behind antennas:
+    (M, L_rx, P, N), in place without a margin."""
     groups, elements, chirps, size = samples.shape
+    size -= 2 * work.margin
+    out = np.empty((groups, elements, chirps, size), np.complex64) if work.margin else samples
     power, key0, key1 = work.noise.numbers
     for row, (m, p) in enumerate(np.ndindex(groups, chirps)):
         own = _read(samples[m, :, p], row, work) * work.turns.factor(row, size)
@@ -149,27 +154,25 @@ def finish(samples: np.ndarray, work: Work) -> None:
             for r in range(elements):
                 draw = ((m * elements + r) * chirps + p) * size
                 add_stream(own[r].view(np.float32), power, key0, key1, np.uint64(draw))
-        samples[m, :, p] = _converted(own, work)
+        out[m, :, p] = _converted(own, work)
+    return out
 
 
 def _read(own: np.ndarray, row: int, work: Work) -> np.ndarray:
-    """Samples (L_rx, N) read at other places; beyond a chirp's ends there are none."""
+    """Samples (L_rx, N) read at other places, from those of the margins too."""
     if work.taps is None and work.reads is None:
         return own
-    beat, size = work.turns.beat, own.shape[1]
+    beat, size = work.turns.beat, own.shape[1] - 2 * work.margin
     assert beat is not None
-    back = own * phasors(-beat[row] * np.arange(size))
-    margin = -work.first if work.taps is None else len(work.taps) - 1
-    padded = np.pad(back, ((0, 0), (margin, 2 * margin)))
-    if work.reads is not None:
-        return np.sum(
-            [w * padded[:, tap : tap + size] for tap, w in enumerate(work.reads)], axis=0
-        ).astype(np.complex64)
-    assert work.taps is not None and work.shift is not None
+    back = own * phasors(-beat[row] * (np.arange(own.shape[1]) - work.margin))
 
     def beside(tap: int) -> np.ndarray:
-        return padded[:, margin + tap : margin + tap + size]
+        return back[:, work.margin + tap : work.margin + tap + size]
 
+    if work.reads is not None:
+        read = [w * beside(work.first + tap) for tap, w in enumerate(work.reads)]
+        return np.sum(read, axis=0).astype(np.complex64)
+    assert work.taps is not None and work.shift is not None
     slope = sum(work.taps[t, 0] * (beside(t) - beside(-t)) for t in range(1, len(work.taps)))
     bend = work.taps[0, 1] * beside(0) + work.taps[1, 1] * (beside(1) + beside(-1))
     return np.asarray(beside(0) + work.shift * (slope + work.shift * bend), np.complex64)

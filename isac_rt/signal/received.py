@@ -25,7 +25,7 @@ import numpy as np
 
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
 from isac_rt.frame.schedule import codes_of
-from isac_rt.frame.waveform import Waveform
+from isac_rt.frame.waveform import Sweep, Waveform
 from isac_rt.hardware.converter import saturated
 from isac_rt.hardware.front_end import IDEAL, Ends
 from isac_rt.hardware.oscillator import Mask, Oscillator, Record, spread
@@ -66,18 +66,20 @@ def received(
     schedule, tones = heard(waveform, links, receiver, reference)
     tones = _with_elements(tones, waveform, links, receiver, ends)
     delays = np.concatenate([s.delay for _, s in links] or [np.zeros(0)])
-    flicker = _Flicker.of(waveform, reference, ends, tones, delays)
-    turns = _turns(waveform, tones, ends)
+    turns, read = _turns(waveform, tones, ends), _read(waveform, tones, ends)
+    longer = _with_margin(waveform, read.margin)
+    flicker = _Flicker.of(longer, reference, ends, tones, delays)
     if flicker is None:
-        samples = method.samples(waveform, tones)
+        samples = method.samples(longer, tones)
     else:
         alone = flicker.alone(noise.power)
         rest = flicker.binned().select(np.setdiff1d(np.arange(tones.size), alone))
-        samples = method.samples(waveform, rest)
+        samples = method.samples(longer, rest)
         for k in alone:
-            add_direct(samples, waveform, tones.select(np.array([k])), turn=flicker.apart(int(k)))
-        turns = flicker.common(turns)
-    finish(samples, _work(waveform, tones, ends, turns, noise, samples))
+            add_direct(samples, longer, tones.select(np.array([k])), turn=flicker.apart(int(k)))
+        turns = flicker.common(turns, read.margin * waveform.sample_interval)
+    read = replace(read, turns=turns, noise=noise)
+    samples = finish(samples, _work(waveform, ends, read, samples))
     return IFCube(
         samples=samples,
         waveform=waveform,
@@ -146,25 +148,31 @@ def _band(w: Waveform, tones: Tones) -> np.ndarray:
     return data * w.slope / w.sampling_rate + _HEARD
 
 
-def _work(
-    w: Waveform,
-    tones: Tones,
-    ends: Ends,
-    turns: Turns,
-    noise: WhiteNoise,
-    samples: np.ndarray,
-) -> Work:
-    """List the steps of the pass through the `samples`."""
-    work = Work(turns=turns, noise=noise)
+def _read(w: Waveform, tones: Tones, ends: Ends) -> Work:
+    """The places at which samples are read where the transmitter's ramp has errors."""
     ramp = ends.senders[0].ramp if ends.senders else None
-    if ramp is not None:
-        late = _shift(w, tones, ramp)
-        near = short_read(float(np.abs(late).max()))
-        if near is not None:
-            work = replace(work, taps=near.astype(np.float32), shift=late.astype(np.float32))
-        else:
-            first, weights = read_at(late)
-            work = replace(work, reads=weights.astype(np.float32), first=first)
+    if ramp is None:
+        return Work()
+    late = _shift(w, tones, ramp)
+    near = short_read(float(np.abs(late).max()))
+    if near is not None:
+        taps, shift = near.astype(np.float32), late.astype(np.float32)
+        return Work(taps=taps, shift=shift, margin=len(near) - 1)
+    first, weights = read_at(late)
+    return Work(reads=weights.astype(np.float32), first=first, margin=-first)
+
+
+def _with_margin(w: Waveform, margin: int) -> Waveform:
+    """The same chirps sampled from `margin` samples earlier until as many later."""
+    if not margin:
+        return w
+    start = w.window_start - margin * w.sample_interval
+    sweep = Sweep(w.slope, w.chirp_duration, start, w.slot_duration)
+    return replace(w, sweep=sweep, num_samples=w.num_samples + 2 * margin)
+
+
+def _work(w: Waveform, ends: Ends, work: Work, samples: np.ndarray) -> Work:
+    """List the steps of the pass through the `samples`, beginning with `work`."""
     own, c = ends.receiver.receive_response, ends.receiver.converter
     if own is not None and not own.common:
         work = replace(work, elements=sampled(own, w.num_samples).astype(np.complex64))
@@ -181,7 +189,7 @@ def _work(
 def _level(samples: np.ndarray, work: Work, num_chirps: int) -> float:
     """RMS of the strongest element in a chirp like the first of each group, noise included."""
     trial = np.ascontiguousarray(samples[:, :, :1])
-    finish(trial, replace(work, turns=work.turns.of_rows(num_chirps)))
+    trial = finish(trial, replace(work, turns=work.turns.of_rows(num_chirps)))
     return float(np.sqrt((np.abs(trial) ** 2).mean(axis=(0, 2, 3)).max())) or 1.0
 
 
@@ -285,12 +293,12 @@ class _Flicker:
                 add_phases(out, record, self.begin.ravel() - delay, sign)
         return out.reshape(*self.begin.shape, -1)
 
-    def common(self, turns: Turns) -> Turns:
-        """`turns` with the phase of the strongest path."""
+    def common(self, turns: Turns, margin: float) -> Turns:
+        """`turns` with the phase of the strongest path, of samples from `margin` [s] later on."""
         theirs = self.theirs[0] if self.theirs else None
         if theirs is not None and theirs is self.mine and self.main == 0:
             return turns
-        begin, parts = self.begin.ravel(), []
+        begin, parts = self.begin.ravel() + margin, []
         for one, late, sign in ((self.mine, 0.0, 1.0), (theirs, self.main, -1.0)):
             if one is not None:
                 parts.append((one.values, *places_of(one, begin - late, sign)))

@@ -68,7 +68,9 @@ def test_a_cube_comes_back_from_sigmf_and_another_reader_finds_a_sample(cube, tm
     Planted bug: channels and samples exchanged."""
     sigmf = pytest.importorskip("sigmf")
     data, meta = write_sigmf(cube, tmp_path / "c")
-    same(cube, read_sigmf(tmp_path / "c"))
+    # the base, and the names that are printed
+    for name in (tmp_path / "c", data, meta, str(meta)):
+        same(cube, read_sigmf(name))
     theirs = sigmf.fromfile(str(meta))
     theirs.validate()
     read = theirs.read_samples()
