@@ -251,7 +251,7 @@ MAX_LINES = {
     "capture": 1900,
     "simulation": 3280,
     "sweep": 2350,
-    "views": 3100,
+    "views": 3060,
     "cli": 2100,
     "extensions": 5800,
 }

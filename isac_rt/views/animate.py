@@ -110,7 +110,7 @@ class _Moving:
             name: ax.plot([], [], mark, color="black", ms=size, mfc="none", label=alone + words)[0]
             for name, (mark, size, words) in fused.items()
         }
-        ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
+        ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, alignment="left")
 
     def show(self, frame: int) -> None:
         position = self._d.uav_position.values

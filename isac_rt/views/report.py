@@ -39,57 +39,22 @@ from isac_rt.views.tables import (
 from isac_rt.views.walls import MOST_WALLS, walls
 from isac_rt.world.city.mesh import CityMesh
 
-_CAPTIONS = {
-    "scene": (
-        "The scene",
-        "The swarm from above. The darker a face of the city, the higher it lies.",
-    ),
-    "range_doppler": (
-        "Range and Doppler",
-        "Power after accumulation over the antennas, the brightest colours at 60 dB and above. "
-        "Marks are detections, by the kind of the "
-        "strongest ray-traced path within one cell; "
-        "white circles are where the truth puts the UAVs in view, detected or not. A passive "
-        "terminal measures path lengths: "
-        "reflectors stand at transmitter to UAV to receiver.",
-    ),
-    "equivalent_range": (
-        "Equivalent range",
-        "What the receiver sees before it removes the data: each chirp's delay symbol moves every "
-        "path by the same number of cells.",
-    ),
-    "tracks": (
-        "Tracks against truth",
-        "Seen from one terminal. Estimates are drawn at the UAV they were associated with after "
-        "the fact, by the path that caused them; the receiver does not know it. Shaded: hidden by "
-        "the city.",
-    ),
-    "errors": (
-        "Errors",
-        "Distribution of the errors of estimates of targets, then of terminals, which report their "
-        "position; n estimates each. A UAV that is never found has no error here.",
-    ),
-    "paths": (
-        "Paths",
-        "Every path of the snapshot frames. Gain holds antenna elements and reflections, not the "
-        "transmit power.",
-    ),
-    "decoding": (
-        "Data",
-        "Errors among the data symbols of every frame; frames without a decision count as lost in "
-        "the tables.",
-    ),
-    "link": (
-        "Links over time",
-        "Above, the reference path: the strongest target at the active terminal, the line of sight "
-        "at a passive one. Below, what arrives "
-        "by each kind of path.",
-    ),
-}
+FIGURES = (
+    "scene",
+    "range_doppler",
+    "equivalent_range",
+    "tracks",
+    "errors_terminals",
+    "errors",
+    "paths",
+    "decoding",
+    "link",
+)
+"""Beginnings of the names of figures that have a place on the page; others stand at its end."""
 
 
 def _scene(dataset: xr.Dataset, city: CityMesh | None) -> tuple[str, str]:
-    """The flight as a scene to turn about, and why there is none; empty where there is no city."""
+    """The 3-D scene of the run, or why there is none; empty where there is no city."""
     if city is None or "track_state" not in dataset:
         return "", ""
     try:
@@ -104,26 +69,20 @@ def wall_table(dataset: xr.Dataset, city: CityMesh) -> Table:
     return Table([*found.columns], [[number(v) for v in row] for row in found.values.tolist()])
 
 
-def _embedded(pictures: Sequence[Path]) -> list[dict[str, str]]:
-    out, last = [], ""
+def _embedded(pictures: Sequence[Path]) -> dict[str, list[str]]:
+    """The pictures in base 64 by `FIGURES`."""
+    out: dict[str, list[str]] = {key: [] for key in (*FIGURES, "other")}
     for picture in pictures:
-        key = next(
-            (k for k in _CAPTIONS if picture.stem == k or picture.stem.startswith(f"{k}_")), ""
-        )
-        heading, caption = _CAPTIONS.get(key, (picture.stem, ""))
-        data = base64.b64encode(picture.read_bytes()).decode()
-        out.append(
-            {"heading": "" if heading == last else heading, "caption": caption, "data": data}
-        )
-        last = heading
+        key = next((key for key in FIGURES if f"{picture.stem}_".startswith(f"{key}_")), "other")
+        out[key].append(base64.b64encode(picture.read_bytes()).decode())
     return out
 
 
 def write_report(
     results: Results, folder: str | Path, pictures: Sequence[Path], city: CityMesh | None = None
 ) -> Path:
-    """Write ``report.html`` into `folder` with the figures `pictures` embedded, and with the scene
-    to turn about in the `city` if it is given; nothing in it is fetched from elsewhere.
+    """Write ``report.html`` into `folder` with the figures `pictures` embedded, and with the 3-D
+    scene of the `city` if it is given; nothing in it is fetched from elsewhere.
 
     Raises
     ------

@@ -383,8 +383,8 @@ def page_part(figure: Mapping[str, Any], name: str) -> str:
     drawn = json.dumps(figure, separators=(",", ":")).replace("</", "<\\/")
     return (
         f"<script>{script}</script>\n"
-        f'<div id="{name}" style="height: 620px; background: #fff"></div>\n'
-        f"<script>const {name} = {drawn};\n"
+        f'<div id="{name}"></div>\n<script>const {name} = {drawn};\n'
+        f"{name}.layout.showlegend = innerWidth > 700;\n"  # it would cover a phone's scene
         f'Plotly.newPlot("{name}", {name}.data, {name}.layout, {{responsive: true}})'
         f'.then(() => Plotly.addFrames("{name}", {name}.frames));</script>'
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import copy
 import sys
 from pathlib import Path
@@ -159,6 +160,26 @@ def test_tables_fit_the_page(summary):
         cells = zip(found.columns, *found.rows, strict=True)
         width = sum(max(map(len, column)) * 7.5 + 22 for column in cells)
         assert width < 1200, table.__name__
+
+
+def test_the_report_shows_targets_first_and_maps_before_tables(tmp_path):
+    """Every figure stands once, one of an unknown name at the end, and no heading stands without
+    its part. Planted bugs: a figure of errors of terminals among those of targets; the heading of
+    data in a run without them."""
+    results = fake_run()
+    pictures = []
+    for name in ("scene", "range_doppler_0001", "errors", "errors_terminals", "decoding", "mine"):
+        pictures.append(tmp_path / f"{name}.png")
+        pictures[-1].write_bytes(name.encode())
+    page = write_report(results, tmp_path, pictures).read_text()
+    at = {p.stem: page.index(base64.b64encode(p.read_bytes()).decode() + '"') for p in pictures}
+    assert all(page.count(base64.b64encode(p.read_bytes()).decode() + '"') == 1 for p in pictures)
+    parts = [page.index(f"<h2>{t}</h2>") for t in ("Targets", "Range-Doppler maps", "Each UAV")]
+    assert parts == sorted(parts) and parts[1] < at["range_doppler_0001"] < at["errors"] < parts[2]
+    assert page.index("<h2>Terminals</h2>") < at["errors_terminals"] < at["decoding"] < at["mine"]
+    for block in results.summary["links"].values():
+        block["ser_delay"] = None
+    assert "<h2>Data</h2>" not in write_report(results, tmp_path, pictures[:3]).read_text()
 
 
 def test_without_plotly_the_report_says_what_to_install(monkeypatch, tmp_path):
