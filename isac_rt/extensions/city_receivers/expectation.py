@@ -27,6 +27,7 @@ from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.track.expectation import ClutterExpectation, Mistakes
 from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.mirrors import mirror_image
 from isac_rt.world.swarm import Pose, Swarm
 
 NEAR = 40.0
@@ -158,7 +159,7 @@ class MeshExpectation:
         for part in mirrored:
             n, s = part.mirror.normal, part.seen
             met = s.departure if part.before else s.arrival
-            turned = met - 2 * (met @ n)[:, None] * n  # the way from the mirror to the scatterer
+            turned = mirror_image(met, n)  # the way from the mirror to the scatterer
             there, back = (turned, s.arrival) if part.before else (s.departure, turned)
             moved = 0.0 if error is None else 2 * error[part.mirror.faces[0]] * (met @ n)
             yield _Way(s, self._field.cells.face[s.index], there, back, moved)

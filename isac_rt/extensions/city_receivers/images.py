@@ -22,6 +22,7 @@ from isac_rt.kernels.track_images import EDGE, LEAST_RANGE
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import Ambiguity, wrapped
 from isac_rt.track.parts import Own, TrackRule
+from isac_rt.world.mirrors import mirror_image
 from isac_rt.world.swarm import Pose
 
 BESIDE_CELLS = 1.5
@@ -129,8 +130,7 @@ def _by_two(
     A, B, at_j = places.swapaxes(0, 1)
     kept = walls.holds(i, A, EDGE) & walls.holds(j, B, EDGE)
     n, m, at_j = normals[i[kept]], normals[j[kept]], at_j[kept]
-    turned = start[3:] - 2 * (n @ start[3:])[:, None] * n
-    turned -= 2 * (turned * m).sum(axis=1)[:, None] * m
+    turned = mirror_image(mirror_image(start[3:], n), m)
     return lengths(np.hstack([at_j, turned]), end)
 
 
@@ -157,13 +157,13 @@ def met(
     before = normals[last] @ end - offsets[last]
     for i in first:
         s = normals[i] @ start - offsets[i]
-        once = start - 2 * s * normals[i]
+        once = mirror_image(start, normals[i], offsets[i])
         apart, beyond = ((once - end) ** 2).sum(), normals[last] @ once - offsets[last]
         longer = 4 * beyond * before
         some = (longer > max((2 * LEAST_RANGE) ** 2 - apart, 0)) & (longer < reach**2 - apart)
         some &= last != i
         j, share = last[some], (beyond[some] / (beyond[some] + before[some]))[:, None]
-        at_j = once - 2 * beyond[some, None] * normals[j]
+        at_j = mirror_image(once, normals[j], offsets[j])
         B = at_j + (end - at_j) * share
         height = B @ normals[i] - offsets[i]
         A = once + (B - once) * (s / (s + height))[:, None]

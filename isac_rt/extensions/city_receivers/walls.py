@@ -8,6 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.mirrors import mirror_image, over_triangle
+from isac_rt.world.passage import hits
 from isac_rt.world.swarm import Pose
 
 SMALLEST_WALL = 8.0
@@ -115,53 +117,31 @@ class Walls:
         # else the wall stands between the two, or the image is too far
         some = (behind * before > 0) & (apart2 < reach**2)
         tried, n, behind, before = tried[some], n[some], behind[some], before[some]
-        places = body[:3] - 2 * behind[:, None] * n
+        places = mirror_image(body[:3], n, offsets[tried])
         met = end[:3] + (places - end[:3]) * (before / (before + behind))[:, None]
         boxed = self.bounded(tried, met, edge)
         shown = np.flatnonzero(boxed)[self.holds(tried[boxed], met[boxed], edge)]
-        motions = body[3:6] - 2 * (n @ body[3:6])[:, None] * n
-        return tried[shown], np.hstack([places, motions])[shown]
+        return tried[shown], np.hstack([places, mirror_image(body[3:6], n)])[shown]
 
     def holds(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
         """Return whether points (n, 3) in the planes of mirrors (n,) lie on one of their faces, or
         within `edge` of it."""
-        corners, inward, first = self._sides
+        faces, first, _ = self._faces
         count = first[mirrors + 1] - first[mirrors]
         which = np.repeat(np.arange(mirrors.size), count)
         begins = np.cumsum(count) - count
-        face = np.arange(which.size) + np.repeat(first[mirrors] - begins, count)
-        offset = points[which, None] - self.city.origin - corners[face]
-        heights = (inward[face] * offset).sum(axis=2)
-        inside = heights >= -edge * np.linalg.norm(inward[face], axis=2)
+        face = faces[np.arange(which.size) + np.repeat(first[mirrors] - begins, count)]
+        corners, normals = self.city.corners[face], self.city.normals[face]
+        inside = over_triangle(points[which] - self.city.origin, corners, normals, edge)
         out = np.zeros(mirrors.size, bool)
-        out[which[inside.all(axis=1)]] = True
+        out[which[inside]] = True
         return out
-
-    @cached_property
-    def _sides(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the corners (n, 3, 3) of the mirrors' faces one after the other, and vectors from
-        the side behind each to the inside, as long as the side; where each mirror's begin."""
-        faces, first, _ = self._faces
-        corners = self.city.corners[faces]
-        along = np.roll(corners, -1, axis=1) - corners
-        return corners, np.cross(self.city.normals[faces][:, None], along), first
 
     def blocking(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Faces (n,) that the open segment between two points (3,) crosses."""
-        a, b, c = np.moveaxis(self.city.corners, 1, 0)
-        start, span = start - self.city.origin, end - start
-        normal = np.cross(b - a, c - a)
-        slope = normal @ span
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share = (normal * (a - start)).sum(1) / slope
-            point = start + share[:, None] * span
-            inside = [
-                (np.cross(q - p, point - p) * normal).sum(1) >= 0
-                for p, q in ((a, b), (b, c), (c, a))
-            ]
-        return np.flatnonzero(
-            (slope != 0) & (share > 0) & (share < 1) & np.logical_and.reduce(inside)
-        )
+        origin = self.city.origin
+        faces, share = hits(self.city.corners, start - origin, end - origin)
+        return faces[(share > 0) & (share < 1)]
 
 
 def lengths(bodies: np.ndarray, end: np.ndarray) -> np.ndarray:

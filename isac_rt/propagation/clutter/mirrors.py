@@ -30,6 +30,7 @@ from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.legs.reflection import slab_coefficients
 from isac_rt.world.city.materials import Material
 from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.mirrors import mirror_image, over_triangle, plane_crossing
 from isac_rt.world.swarm import Pose
 
 PLACES = 16
@@ -61,11 +62,7 @@ class Mirror:
 
     def image(self, pose: Pose) -> np.ndarray:
         """(3, 3) position, velocity and acceleration of a pose's image."""
-        n = self.normal
-        motion = pose.motion()
-        motion = motion - 2 * (motion @ n)[:, None] * n
-        motion[0] += 2 * self.offset * n
-        return motion
+        return mirror_image(pose.motion(), self.normal, np.array([self.offset, 0.0, 0.0]))
 
 
 def strongest(
@@ -163,18 +160,16 @@ def on_the_wall(
     """Find the points (N, 3) on the viewer's side of a mirror whose way to it from a place (3,)
     meets one of its triangles (T, 3, 3): their numbers, and where.
 
-    The image of a point lies as far behind the wall as the point before it.
+    A wave from the place comes from its image behind the wall.
     """
     above, up = normal @ place - offset, points @ normal - offset
     same = (up * above > 0) & (np.abs(up) >= APART) & (np.abs(above) >= APART)
     which = np.flatnonzero(same).astype(np.int32)
-    up = up[which]
-    share = above / (above + up)
-    foot = place - above * normal
-    met = foot + share[:, None] * (points[which] - up[:, None] * normal - foot)
-    edges = np.roll(corners, -1, axis=1) - corners
-    turns = np.cross(edges, met[:, None, None] - corners) @ normal
-    inside = ((turns >= -1e-9).all(axis=2) | (turns <= 1e-9).all(axis=2)).any(axis=1)
+    image = mirror_image(place, normal, offset)
+    met = plane_crossing(image, points[which], normal, offset)
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = areas / np.linalg.norm(areas, axis=1, keepdims=True)
+    inside = over_triangle(met[:, None], corners, normals, 1e-9).any(axis=1)
     low, high = corners.min(axis=(0, 1)) - 1e-6, corners.max(axis=(0, 1)) + 1e-6
     inside &= ((met >= low) & (met <= high)).all(axis=1)
     return which[inside], met[inside]

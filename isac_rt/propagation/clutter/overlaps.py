@@ -15,6 +15,7 @@ import numpy as np
 from isac_rt.propagation.clutter.cells import Cells
 from isac_rt.propagation.legs.geometry import LIFT
 from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.mirrors import over_triangle
 
 PARALLEL = 0.999
 """Cosine between the normals of faces that may be one surface: steeper ones cross in a strip of
@@ -41,9 +42,8 @@ def lies_twice(cells: Cells, city: CityMesh) -> np.ndarray:
 
 def _inside(points: np.ndarray, corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """(N,) whether points (N, 3) lie within `LIFT` of a triangle (3, 3), over its area."""
-    inward = np.cross(normal, np.roll(corners, -1, axis=0) - corners)
-    within = [(points - corner) @ side >= 0 for corner, side in zip(corners, inward, strict=True)]
-    return np.all(within, axis=0) & (np.abs((points - corners[0]) @ normal) <= LIFT)
+    near = np.abs((points - corners[0]) @ normal) <= LIFT
+    return near & over_triangle(points, corners, normal)
 
 
 def _hidden_first(

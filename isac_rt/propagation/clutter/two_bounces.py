@@ -40,11 +40,11 @@ from isac_rt.propagation.clutter.field import (
 )
 from isac_rt.propagation.clutter.mirrors import Mirror, shown, strongest
 from isac_rt.propagation.legs.bodies import Bodies
-from isac_rt.propagation.legs.reflection import slab_coefficients
+from isac_rt.propagation.legs.reflection import mirrored_field, slab_coefficients, vertical
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.ways import LinkState
 from isac_rt.world.city.mesh import CityMesh
-from isac_rt.world.mirrors import mirror_image
+from isac_rt.world.mirrors import mirror_image, plane_crossing
 from isac_rt.world.swarm import Pose
 
 KNOTS_KEPT = 16
@@ -174,9 +174,8 @@ class TwoBounces:
         place = self._field.cells.points[part.seen.index]
         own = self._field.cells.face[part.seen.index]
         m, body = part.mirror, (state.start if part.before else state.end).position
-        above, up = m.normal @ body - m.offset, place @ m.normal - m.offset
-        image = place - 2 * up[:, None] * m.normal
-        at = body + (above / (above + up))[:, None] * (image - body)
+        image = mirror_image(body, m.normal, m.offset)
+        at = plane_crossing(image, place, m.normal, m.offset)
         wall = np.full(own.size, m.faces[0], own.dtype)
         order = slice(None) if part.before else slice(None, None, -1)
         return np.stack([at, place], axis=1)[:, order], np.stack([wall, own], axis=1)[:, order]
@@ -301,11 +300,11 @@ def weigh(
     n = surfaces.normals[face[i]]
     u, w = (mirror_image(away, normal), home) if before else (away, mirror_image(home, normal))
     if before:
-        field = _mirrored(away, u, normal, slab)
-        passed = (field * _vertical(u)).sum(axis=1)
+        field = mirrored_field(vertical(away), away, u, normal, *slab)
+        passed = (field * vertical(u)).sum(axis=1)
     else:
-        field = _vertical(u)
-        passed = (_mirrored(w, home, normal, slab) * _vertical(home)).sum(axis=1)
+        field, mirrored = vertical(u), mirrored_field(vertical(w), w, home, normal, *slab)
+        passed = (mirrored * vertical(home)).sum(axis=1)
     into, back = (u * n).sum(axis=1), -(w * n).sum(axis=1)
     across = np.cross(u, n)
     whole = (np.abs(field) ** 2).sum(axis=1) * (across**2).sum(axis=1)
@@ -314,28 +313,3 @@ def weigh(
     power = scattered_power(surfaces, face[i], area[i], into, back, -(u * w).sum(axis=1), part)
     power = np.where(into * back > 0, np.maximum(power, 0.0), 0.0)
     gain[:] = scale * share * passed * np.sqrt(power) / (rows.tx_radius * rows.rx_radius)
-
-
-def _vertical(u: np.ndarray) -> np.ndarray:
-    """Field (K, 3) of a vertically polarised isotropic element along unit vectors (K, 3): the
-    spherical unit vector theta."""
-    flat = np.hypot(u[:, 0], u[:, 1])
-    ahead = np.where(flat[:, None] > 0, u[:, :2], [1.0, 0.0])
-    ahead = ahead / np.hypot(ahead[:, :1], ahead[:, 1:])
-    return np.column_stack([u[:, 2:] * ahead, -flat])
-
-
-def _mirrored(
-    u: np.ndarray, out: np.ndarray, normal: np.ndarray, slab: tuple[np.ndarray, np.ndarray]
-) -> np.ndarray:
-    """Field (K, 3), complex, along `out` after a mirror, of waves along unit vectors (K, 3) with
-    the vertical field: its TE part and its TM part by the slab's coefficients (K,)."""
-    across = np.cross(u, normal)
-    upright = np.linalg.norm(across, axis=1) < 1e-9  # any direction will do, at normal incidence
-    axis = np.where(np.abs(u[:, :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0])
-    across = np.where(upright[:, None], np.cross(u, axis), across)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    field = _vertical(u)
-    te = slab[0] * (field * across).sum(axis=1)
-    tm = slab[1] * (field * np.cross(across, u)).sum(axis=1)
-    return te[:, None] * across + tm[:, None] * np.cross(across, out)

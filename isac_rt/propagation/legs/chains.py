@@ -27,6 +27,7 @@ from isac_rt.propagation.legs.rays import rays
 from isac_rt.storage import checksum, kept, pack
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.city.scene import CityScenes
+from isac_rt.world.mirrors import mirror_image
 from isac_rt.world.swarm import Pose
 
 AROUND = 2
@@ -155,9 +156,9 @@ class Search:
             at, along, way, face, last = at[on], along[on], way[on], face[on], plane[on]
             chain = levels.grown(chain[on], last)
             normal = self._city.normals[face]
-            into = (along * normal).sum(1)[:, None]
-            at = at + way[:, None] * along - LIFT * np.sign(into) * normal
-            along = along - 2 * into * normal
+            side = np.sign((along * normal).sum(1))[:, None]
+            at = at + way[:, None] * along - LIFT * side * normal
+            along = mirror_image(along, normal)
         return levels.chains()
 
     def _hit(self, at: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

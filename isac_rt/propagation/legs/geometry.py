@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.mirrors import mirror_image, plane_crossing
 from isac_rt.world.swarm import Pose
 
 LIFT = 2e-3
@@ -65,9 +66,8 @@ def unfold(normals: np.ndarray, offsets: np.ndarray, start: Pose, end: Pose) -> 
     images = [image]
     for b in range(depth):
         n = normals[:, b]
-        image = image - 2 * ((n * image).sum(1) - offsets[:, b])[:, None] * n
-        velocity = velocity - 2 * (n * velocity).sum(1)[:, None] * n
-        acceleration = acceleration - 2 * (n * acceleration).sum(1)[:, None] * n
+        image = mirror_image(image, n, offsets[:, b])
+        velocity, acceleration = mirror_image(velocity, n), mirror_image(acceleration, n)
         images.append(image)
     span = end.position - image
     length = np.linalg.norm(span, axis=1)
@@ -78,10 +78,7 @@ def unfold(normals: np.ndarray, offsets: np.ndarray, start: Pose, end: Pose) -> 
     points = np.empty((count, depth, 3))
     target = np.broadcast_to(end.position, (count, 3))
     for b in range(depth - 1, -1, -1):
-        n, source = normals[:, b], images[b + 1]
-        ray = target - source
-        share = (offsets[:, b] - (n * source).sum(1)) / (n * ray).sum(1)
-        target = source + share[:, None] * ray
+        target = plane_crossing(images[b + 1], target, normals[:, b], offsets[:, b])
         points[:, b] = target
     first = points[:, 0] if depth else np.broadcast_to(end.position, (count, 3))
     departure = first - start.position

@@ -40,7 +40,7 @@ from isac_rt.propagation.legs.legset import LegSet, leg_set
 from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.legs.reflection import mirror_amplitude
 from isac_rt.world.city.mesh import CityMesh
-from isac_rt.world.mirrors import mirror_image
+from isac_rt.world.mirrors import mirror_image, plane_crossing
 from isac_rt.world.swarm import Pose
 
 ASIDE = np.array([[0.061, -0.047, 0.064], [0.052, 0.073, -0.044]])
@@ -272,16 +272,16 @@ def reflected(
     row, place = np.divmod(np.arange(len(images) * len(ends)), len(ends))
     point, faces = ends[place], np.full((row.size, depth), -1)
     for _ in range(depth):  # backwards, from the place to the terminal; row -1: is there
+        plane = chains.plane[row]
+        sides = [
+            (mirrors.normals[plane] * end).sum(axis=1) > mirrors.offsets[plane]
+            for end in (point, images[row])
+        ]
+        row = np.where((row >= 0) & (sides[0] == sides[1]), -2, row)
         on = np.flatnonzero(row >= 0)
-        plane, image = chains.plane[row[on]], images[row[on]]
-        above, behind = (
-            (mirrors.normals[plane] * end).sum(axis=1) - mirrors.offsets[plane]
-            for end in (point[on], image)
-        )
-        crosses = above * behind < 0
-        share = behind / np.where(crosses, behind - above, 1.0)
-        point[on] = image + share[:, None] * (point[on] - image)
-        face = np.where(crosses, _faces_at(mirrors, plane, point[on]), -1)
+        plane, normal, offset = plane[on], mirrors.normals[plane[on]], mirrors.offsets[plane[on]]
+        point[on] = plane_crossing(images[row[on]], point[on], normal, offset)
+        face = _faces_at(mirrors, plane, point[on])
         faces[on] = np.column_stack([face, faces[on, :-1]])
         row[on] = np.where(face >= 0, chains.parent[row[on]], -2)
     return np.column_stack([place, faces])[row == -1]

@@ -9,6 +9,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.legs.geometry import Legs
 from isac_rt.world.city.materials import VACUUM_PERMITTIVITY, Material
 from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.mirrors import mirror_image
 
 
 def slab_coefficients(
@@ -40,6 +41,29 @@ def vertical(direction: np.ndarray) -> np.ndarray:
     return np.stack([direction[:, 2] * x, direction[:, 2] * y, -flat], axis=1)
 
 
+def mirrored_field(
+    field: np.ndarray,
+    along: np.ndarray,
+    out: np.ndarray,
+    normals: np.ndarray,
+    te: np.ndarray,
+    tm: np.ndarray,
+) -> np.ndarray:
+    """Fields (K, 3), complex, along `out` (K, 3) after a mirror of fields along unit vectors
+    (K, 3): the part across the plane of incidence by TE, the part in it by TM (K,)."""
+    across = np.cross(along, normals)
+    size = np.linalg.norm(across, axis=1, keepdims=True)
+    # any direction will do, at normal incidence
+    level = np.cross(along, np.where(np.abs(along[:, :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0]))
+    across = np.where(
+        size > 1e-9,
+        across / np.maximum(size, 1e-9),
+        level / np.linalg.norm(level, axis=1, keepdims=True),
+    )
+    first, second = (field * across).sum(1), (field * np.cross(across, along)).sum(1)
+    return (te * first)[:, None] * across + (tm * second)[:, None] * np.cross(across, out)
+
+
 def mirror_amplitude(
     city: CityMesh, normals: np.ndarray, faces: np.ndarray, legs: Legs, wavelength: float
 ) -> np.ndarray:
@@ -57,26 +81,13 @@ def mirror_amplitude(
     along = legs.departure
     for b in range(depth):
         normal = normals[:, b]
-        into = (along * normal).sum(1)
-        out = along - 2 * into[:, None] * normal
-        across = np.cross(along, normal)
-        size = np.linalg.norm(across, axis=1, keepdims=True)
-        level = np.cross(
-            along, np.where(np.abs(along[:, :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0])
-        )  # any, at normal incidence
-        across = np.where(
-            size > 1e-9,
-            across / np.maximum(size, 1e-9),
-            level / np.linalg.norm(level, axis=1, keepdims=True),
-        )
+        cosine = np.minimum(np.abs((along * normal).sum(1)), 1.0)
         te, tm = np.empty(count, complex), np.empty(count, complex)
         material = city.face_material[faces[:, b]]
         for index in np.unique(material):
             here = material == index
-            te[here], tm[here] = slab_coefficients(
-                city.materials[index], np.minimum(np.abs(into[here]), 1.0), wavelength
-            )
-        first, second = (field * across).sum(1), (field * np.cross(across, along)).sum(1)
-        field = (te * first)[:, None] * across + (tm * second)[:, None] * np.cross(across, out)
+            te[here], tm[here] = slab_coefficients(city.materials[index], cosine[here], wavelength)
+        out = mirror_image(along, normal)
+        field = mirrored_field(field, along, out, normal, te, tm)
         along = out
     return (field * vertical(legs.arrival)).sum(1) * wavelength / (4 * np.pi * legs.length)
