@@ -145,8 +145,9 @@ def test_chains_that_reach_a_place(depth):
     for _ in range(depth - 1):
         each = np.arange(first[-2], first[-1])
         each = each if len(each) < 100 else each[::7]
-        parent.append(np.repeat(each, len(planes)))
-        plane.append(np.tile(planes, len(each)))
+        other = np.tile(planes, len(each)) != np.repeat(np.concatenate(plane)[each], len(planes))
+        parent.append(np.repeat(each, len(planes))[other])
+        plane.append(np.tile(planes, len(each))[other])
         first.append(first[-1] + parent[-1].size)
     chains = Chains(np.concatenate(parent), np.concatenate(plane), np.array(first))
     ends = np.random.default_rng(11).uniform([-20, -20, 2], [20, 20, 25], (12, 3))

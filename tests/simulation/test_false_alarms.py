@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from isac_rt.receive.clutter import angle_doppler, bistatic
 from scipy import stats
 
 from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind
-from isac_rt.receive.clutter import angle_doppler, bistatic
 from isac_rt.scenario.file import load
 from isac_rt.simulation.setup import prepare
 from isac_rt.simulation.simulate import _Observer, standard_terminal
