@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from isac_rt.receive.clutter import angle_doppler, bistatic
 from scipy import stats
 
+from isac_rt.extensions.city_receivers import angle_doppler, bistatic
 from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.scenario.file import load

@@ -226,10 +226,9 @@ def _halves(corners: np.ndarray) -> np.ndarray:
 
 def _points_in(corners: np.ndarray, state: np.ndarray) -> np.ndarray:
     """(K, 3) points, uniform in triangles (K, 3, 3), hashed from states (K,)."""
-    one, share = (
-        ((splitmix64(state, np.uint64(k)) >> np.uint64(11)).astype(float)[:, None] + 0.5) / 2**53
-        for k in range(2)
-    )
+    words = np.arange(2, dtype=np.uint64)[:, None]
+    hashed = (splitmix64(state, words) >> np.uint64(11)).astype(np.float64)
+    one, share = ((hashed + 0.5) / 2**53)[..., None]
     a, b, c = np.moveaxis(corners, 1, 0)
     return a + np.sqrt(one) * (b - a + share * (c - b))
 

@@ -234,7 +234,7 @@ def merged(
         total[one] += total[other]
         kept = np.setdiff1d(np.arange(len(name)), other)
         waiting = [part[kept] for part in (faces, half, place, size, most, total, last)]
-    last, place, size, total, level = (np.concatenate(part) for part in zip(*left, strict=True))
-    order = np.lexsort([level, last])
+    last, place, size, total, fine = (np.concatenate(part) for part in zip(*left, strict=True))
+    order = np.lexsort([fine, last])
     order = order[place[order] >= 0]
     return place[order], size[order], total[order] / np.sqrt(size[order])
