@@ -19,20 +19,20 @@ import numpy as np
 
 from benchmarks import nufft
 from benchmarks.measure import cpu_seconds, floor_seconds
+from isac_rt.extensions.hardware.front_end import Ends, front_end_of
+from isac_rt.extensions.hardware.received import received
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
+from isac_rt.frame.front_end import FrontEnd
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.hardware.front_end import Ends, front_end_of
-from isac_rt.hardware.settings import FrontEnd
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.known import Known
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct, Exact, Gridded, Method
 from isac_rt.signal.noise import WhiteNoise, add_white_noise
-from isac_rt.signal.received import received
 from isac_rt.signal.tones import tones_of
 from isac_rt.world.swarm import Pose
 

@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from isac_rt.capture.calibrate import Calibration as Calibration
-    from isac_rt.capture.calibrate import calibrate as calibrate
-    from isac_rt.capture.readers import import_file as import_file
-    from isac_rt.capture.readers import read_sigmf as read_sigmf
-    from isac_rt.capture.store import load_capture as load_capture
-    from isac_rt.capture.store import load_cube as load_cube
-    from isac_rt.capture.store import save_capture as save_capture
-    from isac_rt.capture.store import save_cube as save_cube
-    from isac_rt.capture.types import Capture as Capture
+    from isac_rt.extensions.hardware.calibrate import Calibration as Calibration
+    from isac_rt.extensions.hardware.calibrate import calibrate as calibrate
+    from isac_rt.extensions.hardware.readers import import_file as import_file
+    from isac_rt.extensions.hardware.readers import read_sigmf as read_sigmf
+    from isac_rt.extensions.hardware.store import load_capture as load_capture
+    from isac_rt.extensions.hardware.store import load_cube as load_cube
+    from isac_rt.extensions.hardware.store import save_capture as save_capture
+    from isac_rt.extensions.hardware.store import save_cube as save_cube
+    from isac_rt.extensions.hardware.types import Capture as Capture
     from isac_rt.frame.cube import IFCube as IFCube
     from isac_rt.frame.cube import ReceiveArray as ReceiveArray
     from isac_rt.frame.cube import Reference as Reference
@@ -75,10 +75,10 @@ if TYPE_CHECKING:
     from isac_rt.views.scene import scene_3d as scene_3d
 
 _NAMES = {
-    "capture.calibrate": "Calibration calibrate",
-    "capture.readers": "import_file read_sigmf",
-    "capture.store": "load_capture load_cube save_capture save_cube",
-    "capture.types": "Capture",
+    "extensions.hardware.calibrate": "Calibration calibrate",
+    "extensions.hardware.readers": "import_file read_sigmf",
+    "extensions.hardware.store": "load_capture load_cube save_capture save_cube",
+    "extensions.hardware.types": "Capture",
     "frame.cube": "IFCube ReceiveArray Reference Transmission",
     "frame.waveform": "Waveform",
     "propagation.pathset": "PathKind PathSet",

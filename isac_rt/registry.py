@@ -131,6 +131,26 @@ COOPERATIONS = Registry(
     {name: "isac_rt.extensions.cooperation.swarm:Cooperation" for name in ("tracks", "detections")},
 )
 """Functions of a `Setup` that return an `isac_rt.simulation.simulate.Exchange`."""
+ACCESS = Registry(
+    "access",
+    {
+        "establish": "isac_rt.extensions.access.protocol:establish_links",
+        "feedback": "isac_rt.extensions.access.feedback:exchange",
+    },
+)
+"""Stages before the data and feedback after them."""
+HARDWARE = Registry(
+    "hardware",
+    {
+        "front_end": "isac_rt.extensions.hardware.front_end:front_end_of",
+        "ends": "isac_rt.extensions.hardware.front_end:Ends",
+        "samples": "isac_rt.extensions.hardware.received:received",
+        "noise_left_out": "isac_rt.extensions.hardware.received:noise_left_out",
+        "calibration": "isac_rt.extensions.hardware.calibrate:load_calibration",
+        "calibrated": "isac_rt.extensions.hardware.calibrate:ideal",
+    },
+)
+"""Front ends that are not ideal, their samples, and the calibration of boards."""
 CITY_SOURCES = Registry(
     "city_sources",
     {

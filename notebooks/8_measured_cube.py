@@ -24,11 +24,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import isac_rt as irt
-from isac_rt.capture.calibrate import apply
-from isac_rt.capture.description import Description
-from isac_rt.capture.explain import STEPS, simulated, unexplained_by
-from isac_rt.capture.sense import range_azimuth
-from isac_rt.capture.types import measured_folder
+from isac_rt.extensions.hardware.calibrate import apply
+from isac_rt.extensions.hardware.description import Description
+from isac_rt.extensions.hardware.explain import STEPS, simulated, unexplained_by
+from isac_rt.extensions.hardware.sense import range_azimuth
+from isac_rt.extensions.hardware.types import measured_folder
 from isac_rt.views.measured import picture
 
 file = measured_folder() / "phaseMismatchCalibration.mat"

@@ -12,9 +12,10 @@ import pandas as pd
 from matplotlib.axes import Axes
 from scipy import stats
 
-from isac_rt.access.dma import isolation
-from isac_rt.access.feedback import correct, frames_to_repair, summarise
-from isac_rt.access.protocol import Clock, Network, establish
+from isac_rt.extensions.access.dma import isolation
+from isac_rt.extensions.access.feedback import correct, frames_to_repair, summarise
+from isac_rt.extensions.access.protocol import Network, establish
+from isac_rt.frame.clock import Clock
 from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.frame.link import Link
 from isac_rt.frame.payload import random_payload

@@ -15,17 +15,18 @@ from math import pi
 
 import numpy as np
 
+from isac_rt.extensions.hardware.converter import HEADROOM_DB
+from isac_rt.extensions.hardware.front_end import IDEAL, Ends, front_end_of
+from isac_rt.extensions.hardware.front_end import FrontEnd as Built
+from isac_rt.extensions.hardware.oscillator import Mask
+from isac_rt.extensions.hardware.received import received
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
+from isac_rt.frame.front_end import FrontEnd, Oscillator
 from isac_rt.frame.link import Link
 from isac_rt.frame.payload import MODULATION_ORDERS, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.hardware.converter import HEADROOM_DB
-from isac_rt.hardware.front_end import IDEAL, Ends, front_end_of
-from isac_rt.hardware.front_end import FrontEnd as Built
-from isac_rt.hardware.oscillator import Mask
-from isac_rt.hardware.settings import FrontEnd, Oscillator
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.active import receive_active
@@ -34,7 +35,6 @@ from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.settings import Receivers
 from isac_rt.signal.methods import Direct
 from isac_rt.signal.noise import WhiteNoise
-from isac_rt.signal.received import received
 from reproduce.symbols import link_waveform, paper_antennas
 from reproduce.waves import STILL, sender, waves
 

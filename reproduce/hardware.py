@@ -16,11 +16,11 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from isac_rt.extensions.hardware.oscillator import Mask, spread
+from isac_rt.frame.front_end import FrontEnd, Oscillator
 from isac_rt.frame.payload import MODULATION_ORDERS
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
-from isac_rt.hardware.oscillator import Mask, spread
-from isac_rt.hardware.settings import FrontEnd, Oscillator
 from isac_rt.randomness import generator
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate

@@ -16,13 +16,14 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.fft
 
+from isac_rt.extensions.hardware.front_end import Ends, front_end_of
+from isac_rt.extensions.hardware.received import received
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import ReceiveArray, Reference
+from isac_rt.frame.front_end import FrontEnd
 from isac_rt.frame.payload import Payload, running_phases
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.hardware.front_end import Ends, front_end_of
-from isac_rt.hardware.settings import FrontEnd
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.pathset import PathKind, merge
 from isac_rt.propagation.settings import Clutter
@@ -32,7 +33,6 @@ from isac_rt.receive.symbols.powers import WEAKEST_WEIGHT, decide, decide_transi
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct
 from isac_rt.signal.noise import WhiteNoise
-from isac_rt.signal.received import received
 from isac_rt.world.swarm import Pose
 from reproduce.montecarlo import Counts, Curve, Precision, sample
 from reproduce.outcome import Progress

@@ -440,32 +440,32 @@ OF_CASES = {
         "betaincinv(successes + 1, trials - successes + 1, tail)",
     ),
     "boards before a corner reflector": Bug(
-        "capture/calibrate.py",
+        "extensions/hardware/calibrate.py",
         "still = y * ti_window(size) * np.exp(",
         "still = y * np.exp(",
     ),
     "measured echo explained by the simulated": Bug(
-        "capture/calibrate.py",
+        "extensions/hardware/calibrate.py",
         "delay = delay + one.rx_delay[:, None] + one.tx_delay",
         "delay = delay - one.rx_delay[:, None] + one.tx_delay",
     ),
     "each part of a board counts": Bug(
-        "capture/calibrate.py",
+        "extensions/hardware/calibrate.py",
         "out = out * turn * (1 + one.response_slope * place)",
         "out = out * turn * (1 + 0 * one.response_slope * place)",
     ),
     "people in a measured frame": Bug(
-        "capture/readers.py",
+        "extensions/hardware/readers.py",
         "np.where(values >= 32768, values - 65536.0, values)",
         "np.where(values >= 65536, values - 65536.0, values)",
     ),
     "channels of a measured mover in line": Bug(
-        "capture/types.py",
+        "extensions/hardware/types.py",
         "np.sin(np.pi * (np.arange(size) + 1) / (size + 1)) ** 2",
         "np.sin(np.pi * (np.arange(size) + 1) / (size + 1)) ** 9",
     ),
     "phase shifters of a cascade": Bug(
-        "hardware/settings.py", '"errors_std_deg": 2.2}', '"errors_std_deg": 3.2}'
+        "frame/front_end.py", '"errors_std_deg": 2.2}', '"errors_std_deg": 3.2}'
     ),
     "small uav as published": Bug(
         "propagation/rcs.py", '{"small": 3.74, "large": 2.50}', '{"small": 3.47, "large": 2.50}'
@@ -666,7 +666,7 @@ OF_TESTS = (
     ),
     (
         "test_access_stages::test_the_timetable_on_paper",
-        Bug("access/protocol.py", "0.0 if data else n.hold", "n.hold"),
+        Bug("extensions/access/protocol.py", "0.0 if data else n.hold", "n.hold"),
     ),
     (
         "test_keys::test_stored_paths_hold_the_instant_the_links_and_every_pose",
@@ -736,12 +736,16 @@ OF_TESTS = (
     ),
     (
         "test_import::test_numbers_that_lost_their_sign_get_it_back",
-        Bug("capture/readers.py", "np.where(values >= 32768,", "np.where(values > 32768,"),
+        Bug(
+            "extensions/hardware/readers.py",
+            "np.where(values >= 32768,",
+            "np.where(values > 32768,",
+        ),
     ),
     (
         "test_over_the_chirp::test_tables_are_decibels_and_degrees",
         Bug(
-            "hardware/sweep.py",
+            "extensions/hardware/sweep.py",
             "np.interp(x, np.linspace(-1, 1, len(table)), table)",
             "np.interp(x, np.linspace(-1, 1, len(table)), table, left=0.0, right=0.0)",
         ),
@@ -765,7 +769,7 @@ OF_TESTS = (
     (
         "test_channels::test_draws_scatter_as_stated_and_differ_by_terminal",
         Bug(
-            "hardware/channels.py",
+            "extensions/hardware/channels.py",
             "rng.normal(size=size) * spread",
             "np.full(size, rng.normal()) * spread",
         ),

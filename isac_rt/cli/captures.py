@@ -13,7 +13,7 @@ from isac_rt.cli.arguments import InputProblem
 from isac_rt.cli.console import say, say_table, working
 
 if TYPE_CHECKING:
-    from isac_rt.capture.types import Capture
+    from isac_rt.extensions.hardware.types import Capture
 
 DescriptionFile = Annotated[
     Path | None,
@@ -62,7 +62,7 @@ def import_(
 ) -> None:
     """Convert the file of a radar board into a cube of IF samples. Reads TI's calibration (.mat),
     DCA1000 (.bin), NumPy (.npy) and SigMF."""
-    from isac_rt.capture.store import load_capture, save_capture
+    from isac_rt.extensions.hardware.store import load_capture, save_capture
     from isac_rt.results.files import check_folder
 
     check_folder(out.parent)
@@ -98,9 +98,9 @@ def calibrate(
 ) -> None:
     """Calibrate a board with one strong reflector. Estimates gains, phases, delays and the response
     over the sweep."""
-    from isac_rt.capture.calibrate import calibrate as fit
-    from isac_rt.capture.calibrate import save_calibration
-    from isac_rt.capture.explain import STEPS, unexplained_by
+    from isac_rt.extensions.hardware.calibrate import calibrate as fit
+    from isac_rt.extensions.hardware.calibrate import save_calibration
+    from isac_rt.extensions.hardware.explain import STEPS, unexplained_by
     from isac_rt.results.files import check_folder
     from isac_rt.storage import write_whole
 
@@ -182,8 +182,8 @@ def receive(
     range-Doppler map and the range-azimuth map."""
     import numpy as np
 
-    from isac_rt.capture.sense import as_dataset, range_azimuth, sense
     from isac_rt.document import Document
+    from isac_rt.extensions.hardware.sense import as_dataset, range_azimuth, sense
     from isac_rt.receive.settings import Receivers
     from isac_rt.results.files import check_folder, write_dataset, write_figure
     from isac_rt.views.measured import drawn
@@ -206,8 +206,8 @@ def receive(
 
 
 def _imported(file: Path, description: Path | None, format: str | None) -> Capture:
-    from isac_rt.capture.description import load_description
-    from isac_rt.capture.readers import FORMATS, import_file
+    from isac_rt.extensions.hardware.description import load_description
+    from isac_rt.extensions.hardware.readers import FORMATS, import_file
 
     if format is not None and format not in FORMATS:
         raise InputProblem(f"--format {format}: choose from {', '.join(FORMATS)}")
@@ -216,8 +216,8 @@ def _imported(file: Path, description: Path | None, format: str | None) -> Captu
 
 def _opened(file: Path, description: Path | None) -> Capture:
     """A cube that `import` wrote, or what `import` would make of a board's file."""
-    from isac_rt.capture.readers import SUFFIXES
-    from isac_rt.capture.store import load_capture
+    from isac_rt.extensions.hardware.readers import SUFFIXES
+    from isac_rt.extensions.hardware.store import load_capture
 
     if file.suffix in SUFFIXES or description is not None:
         return _imported(file, description, None)
@@ -225,6 +225,6 @@ def _opened(file: Path, description: Path | None) -> Capture:
 
 
 def _calibrated(capture: Capture, calibration: Path | None) -> Capture:
-    from isac_rt.capture.calibrate import apply, load_calibration
+    from isac_rt.extensions.hardware.calibrate import apply, load_calibration
 
     return capture if calibration is None else apply(load_calibration(calibration), capture)

@@ -212,7 +212,7 @@ class Reception:
     sparse : where the velocities came from sparse sampling with OMP or from a conventional
         schedule, whether the scene is sparse enough for OMP (`isac_rt.receive.omp.sparse_enough`);
         False advises the transmitter to fall back from a pseudo-random schedule to a conventional
-        one (`isac_rt.access.fall_back`). None elsewhere
+        one (`isac_rt.simulation.fall_back`). None elsewhere
     correction : what the frame's clutter says of the own velocity and of the level that the
         terminal expects; None where a detector does not ask
     placed : whether what it shows can be placed: not where data were read over a path that nothing

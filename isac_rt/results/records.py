@@ -95,7 +95,7 @@ class ObserverRecord:
     symbols : what was sent to it and became of it
     latency : frames after which its data were read, -1: they were not
     fell_back : whether the transmitter sent the conventional schedule in place of the scenario's
-        (`isac_rt.access.fall_back`)
+        (`isac_rt.simulation.fall_back`)
     num_false, num_clutter : detections that no path explains, and those that something other than a
         UAV's own path explains
     slips : symbols decided outside their alphabet

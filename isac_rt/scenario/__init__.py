@@ -1,8 +1,8 @@
 """The whole input of a run as a frozen, typed tree; `isac_rt.scenario.file` reads and writes it."""
 
-from isac_rt.access.settings import Access
+from isac_rt.frame.access import Access
+from isac_rt.frame.front_end import FrontEnd
 from isac_rt.frame.settings import Array, Modulation, Noise, RoleChange
-from isac_rt.hardware.settings import FrontEnd
 from isac_rt.propagation.settings import Clutter, Leakage, Propagation
 from isac_rt.receive.settings import Receivers
 from isac_rt.scenario.radio import Radio

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from isac_rt.frame import settings
-from isac_rt.hardware.settings import FrontEnd
+from isac_rt.frame.front_end import FrontEnd
 
 
 class Radio(settings.Radio):

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
-from isac_rt.hardware.settings import FrontEnd
+from isac_rt.frame.front_end import FrontEnd
 from isac_rt.settings import Problem
 from isac_rt.world import settings
 from isac_rt.world.settings import Formation, Waypoint

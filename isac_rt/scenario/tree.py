@@ -25,9 +25,9 @@ from pydantic import (
 )
 
 from isac_rt import registry
-from isac_rt.access.settings import Access
+from isac_rt.frame.access import Access
+from isac_rt.frame.front_end import Elements, FrontEnd
 from isac_rt.frame.settings import Array, Modulation, Noise, RoleChange
-from isac_rt.hardware.settings import Elements, FrontEnd
 from isac_rt.propagation.settings import Clutter, Propagation
 from isac_rt.receive.settings import Receivers
 from isac_rt.scenario.presets import Preset, ReceiverSet, with_preset

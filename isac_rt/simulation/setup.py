@@ -11,10 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from isac_rt.access.connect import Connections
-from isac_rt.access.protocol import Clock, Network, establish
-from isac_rt.capture.calibrate import Calibration, ideal, load_calibration
 from isac_rt.frame.antennas import Antennas, antennas_of
+from isac_rt.frame.clock import Clock
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.level import (
     LinkBudget,
@@ -27,7 +25,6 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import Schedule, codes_of, schedule_of
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform, waveform_of
-from isac_rt.hardware.front_end import Ends, FrontEnd, front_end_of
 from isac_rt.propagation.build import Ground, make_propagation
 from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.free_space import FreeSpace
@@ -36,13 +33,13 @@ from isac_rt.propagation.pathset import PathSet
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
-from isac_rt.registry import MESH_KNOWLEDGE
+from isac_rt.registry import ACCESS, HARDWARE, MESH_KNOWLEDGE
 from isac_rt.results.provenance import path_content
 from isac_rt.results.records import Use
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import noisy_if_signal
 from isac_rt.signal.noise import WhiteNoise
-from isac_rt.signal.received import noise_left_out, received
+from isac_rt.simulation.connections import Connections
 from isac_rt.simulation.coverage import Coverage, coverage
 from isac_rt.simulation.plan import Plan
 from isac_rt.simulation.preflight import (
@@ -120,19 +117,21 @@ class Frame:
         """E|n|^2 of a sample at a link's receiver [W], Gaussian clutter included."""
         return self._setup.noise_power(self.poses, Link(*link))
 
-    def ends(self, link: tuple[str, str]) -> Ends:
-        """The hardware that shows in the samples of a link's receiver."""
+    def ends(self, link: tuple[str, str]) -> Any:
+        """The hardware that shows in the samples of a link's receiver
+        (`isac_rt.extensions.hardware.front_end.Ends`)."""
         link, all_of = Link(*link), self._setup.front_ends
         senders = dict.fromkeys([link.tx, *self.sent])
         each = [all_of[name] for name in senders for _ in self.sent[name].streams()]
-        return Ends(all_of[link.rx], tuple(each))
+        return HARDWARE.load("ends")(all_of[link.rx], tuple(each))
 
     def oscillator_noise_left_out(self, link: tuple[str, str]) -> float:
         """Noise within a chirp that `samples` leave out, over the thermal noise."""
-        link, power = Link(*link), self.noise_power(link)
-        return noise_left_out(self._setup.waveform, self._arriving(link), self.ends(link), power)
+        link, power, waveform = Link(*link), self.noise_power(link), self._setup.waveform
+        left_out = HARDWARE.load("noise_left_out")
+        return float(left_out(waveform, self._arriving(link), self.ends(link), power))
 
-    def samples(self, link: tuple[str, str], ends: Ends | None = None) -> IFCube:
+    def samples(self, link: tuple[str, str], ends: Any = None) -> IFCube:
         """IF samples of a link's receiver, dechirped in the resource blocks of the link's
         transmitter, with noise; by other `ends` than the terminals' own hardware if there are some.
 
@@ -142,11 +141,14 @@ class Frame:
         link, s = Link(*link), self._setup
         arriving, noise = self._arriving(link), self._noise(link)
         method = s.plan.synthesis(sum(len(p) for _, p in arriving), noise.power)
-        ends = self.ends(link) if ends is None else ends
-        if not ends.ideal:
-            heard = self._listening(link)
-            return received(s.waveform, arriving, *heard, ends, method, noise)
-        return noisy_if_signal(s.waveform, arriving, *self._listening(link), method, noise)
+        heard = self._listening(link)
+        if ends is None and not s.has_ideal_hardware:
+            ends = self.ends(link)
+        if ends is not None and not ends.ideal:
+            make = HARDWARE.load("samples")
+            cube: IFCube = make(s.waveform, arriving, *heard, ends, method, noise)
+            return cube
+        return noisy_if_signal(s.waveform, arriving, *heard, method, noise)
 
     def heard(self, link: tuple[str, str]) -> IFCube:
         """The samples that a link's receiver is given, the board's errors taken out."""
@@ -237,28 +239,34 @@ class Setup:
     def schedule(self) -> Schedule:
         return self.timetable.schedule
 
-    @cached_property
-    def front_ends(self) -> dict[str, FrontEnd]:
-        """The hardware of every terminal."""
+    @property
+    def has_ideal_hardware(self) -> bool:
+        """True if no front end of the scenario departs from the ideal."""
         s = self.scenario
+        return all(s.front_end_of(name).ideal for name, u in s.swarm.items() if u.role != "target")
+
+    @cached_property
+    def front_ends(self) -> dict[str, Any]:
+        """The hardware of every terminal (`isac_rt.extensions.hardware.front_end.FrontEnd`)."""
+        s, make = self.scenario, HARDWARE.load("front_end")
         return {
-            name: front_end_of(s.front_end_of(name), self.waveform, self.antennas, s.seed, name)
+            name: make(s.front_end_of(name), self.waveform, self.antennas, s.seed, name)
             for name, uav in s.swarm.items()
             if uav.role != "target"
         }
 
     @cached_property
-    def calibration(self) -> Calibration | None:
+    def calibration(self) -> Any:
         """Return the calibration of the terminals' boards that `radio.calibration` names.
 
         Raises
         ------
-        isac_rt.capture.types.CaptureError  If the file is none, or of another board.
+        isac_rt.extensions.hardware.types.CaptureError  If the file is none, or of another board.
         """
         file = self.scenario.calibration_path()
         if file is None:
             return None
-        found = load_calibration(file)
+        found = HARDWARE.load("calibration")(file)
         found.check_size(self.antennas.num_rx, self.antennas.num_tx)
         return found
 
@@ -266,7 +274,8 @@ class Setup:
         """Samples without what the calibration says of the board."""
         if self.calibration is None:
             return cube
-        return ideal(self.calibration, cube)
+        corrected: IFCube = HARDWARE.load("calibrated")(self.calibration, cube)
+        return corrected
 
     @cached_property
     def walls(self) -> Any:
@@ -585,28 +594,7 @@ def _connected(setup: Setup) -> Setup:
     if not s.access.establish:
         return replace(setup, connections=Connections(clocks))
 
-    def scene(when: float, links: list[Link]) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
-        poses = setup.swarm.poses(when)
-        return poses, setup.propagation.trace(poses, when, links).paths if links else {}
-
-    first = setup.swarm.poses(timetable.epoch(0))
-    network = Network(
-        waveform=setup.waveform,
-        antennas=setup.antennas,
-        schedule=setup.schedule,
-        receivers=s.receivers,
-        scene=scene,
-        wishes=s.first_blocks(),
-        listeners={name: tuple(passive) for name in active},
-        noise_power={name: setup.noise_power(first, Link(name, name)) for name in active}
-        | {name: setup.noise_power(first, Link(active[0], name)) for name in passive},
-        seed=s.seed,
-        clocks=clocks,
-        amplitude=setup.plan.amplitude,
-        external_clock=s.access.synchronisation != "two_round",
-        dpsk_order=s.modulation.dpsk_order,
-    )
-    outcome = establish(replace(network, start=-network.longest))
+    outcome = ACCESS.load("establish")(setup, clocks)
     found = Connections(clocks, outcome)
     timetable = replace(timetable, blocks=outcome.blocks, refused=found.refused)
     plan = replace(setup.plan, timetable=timetable)

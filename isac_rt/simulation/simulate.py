@@ -15,13 +15,11 @@ from typing import Any, NamedTuple, Protocol
 
 from threadpoolctl import threadpool_limits
 
-from isac_rt.access.fall_back import Schedules
-from isac_rt.access.feedback import exchange
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
 from isac_rt.plain import plain, restored
 from isac_rt.receive.settings import Receivers
-from isac_rt.registry import COOPERATIONS, EQUIPMENT
+from isac_rt.registry import ACCESS, COOPERATIONS, EQUIPMENT
 from isac_rt.results.metrics import SymbolCount
 from isac_rt.results.provenance import provenance
 from isac_rt.results.recorder import Figures, Recorder, Results
@@ -31,6 +29,7 @@ from isac_rt.results.swarm import SwarmScorer, View
 from isac_rt.runtime import tracing_in_one_thread
 from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.scenario.tree import OWN, Scenario
+from isac_rt.simulation.fall_back import Schedules
 from isac_rt.simulation.plan import decisions, extent, mechanisms
 from isac_rt.simulation.preflight import receivers_at_work
 from isac_rt.simulation.resume import Resume
@@ -171,7 +170,7 @@ class _Observer:
         if not isinstance(self.terminal, PassiveTerminal):
             return
         s, when = self.setup, self.setup.timetable.epoch(frame, self.link.tx)
-        answer = exchange(
+        answer = ACCESS.load("feedback")(
             heard.reception,
             heard.tracks,
             at_active.tracks,

@@ -8,16 +8,23 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from isac_rt.access.connect import Connections
-from isac_rt.access.fall_back import Schedules
-from isac_rt.access.feedback import correct, echo_of, exchange, frames_to_repair, summarise
-from isac_rt.access.protocol import Clock, Establishment, LinkState
-from isac_rt.access.synchronise import EXTERNAL, ClockEstimate, round_of
+from isac_rt.extensions.access.feedback import (
+    correct,
+    echo_of,
+    exchange,
+    frames_to_repair,
+    summarise,
+)
+from isac_rt.extensions.access.protocol import Establishment, LinkState
+from isac_rt.extensions.access.synchronise import EXTERNAL, ClockEstimate, round_of
+from isac_rt.frame.clock import Clock
 from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.plain import plain, restored
 from isac_rt.receive.types import Detections, Reception, no_detections
+from isac_rt.simulation.connections import Connections
+from isac_rt.simulation.fall_back import Schedules
 from isac_rt.track.filter import Gaussian
 from isac_rt.track.tracker import Track, TrackSet, track_set
 from isac_rt.world.swarm import Pose

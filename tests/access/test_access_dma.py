@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.access.dma import isolation, mix, raised_cosine
+from isac_rt.extensions.access.dma import isolation, mix, raised_cosine
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import random_payload, unmodulated

@@ -10,7 +10,7 @@ import pytest
 from receiver_cubes import ANTENNAS, Path, cube
 from scipy import stats
 
-from isac_rt.access.feedback import Feedback, correct, frames_to_repair, summarise
+from isac_rt.extensions.access.feedback import Feedback, correct, frames_to_repair, summarise
 from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import integrate, special, stats
 
-from isac_rt.access.identify import (
+from isac_rt.extensions.access.identify import (
     HOT_RATE,
     choose_run,
     consensus,
@@ -15,7 +15,7 @@ from isac_rt.access.identify import (
     hot_threshold,
     needed_chirps,
 )
-from isac_rt.access.ook import Codebook, Message, keyed, read, repeats, threshold
+from isac_rt.extensions.access.ook import Codebook, Message, keyed, read, repeats, threshold
 from isac_rt.frame.waveform import Waveform
 
 SIGMAS = 4.5  # statistical: fails by chance once in 10^5

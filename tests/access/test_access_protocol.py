@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isac_rt.access.ook import Message
-from isac_rt.access.protocol import Clock, Network, establish, scan
-from isac_rt.access.synchronise import EXTERNAL
+from isac_rt.extensions.access.ook import Message
+from isac_rt.extensions.access.protocol import Network, establish, scan
+from isac_rt.extensions.access.synchronise import EXTERNAL
 from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.clock import Clock
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.access.connect import Connections
-from isac_rt.access.protocol import Clock, Establishment, LinkState
-from isac_rt.access.settings import Access
-from isac_rt.access.synchronise import ClockEstimate
+from isac_rt.extensions.access.protocol import Establishment, LinkState
+from isac_rt.extensions.access.synchronise import ClockEstimate
+from isac_rt.frame.access import Access
+from isac_rt.frame.clock import Clock
 from isac_rt.frame.settings import Array, Modulation, Noise, RoleChange
 from isac_rt.propagation.settings import Propagation
 from isac_rt.receive.settings import Receivers
@@ -16,6 +16,7 @@ from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
+from isac_rt.simulation.connections import Connections
 
 C = 299792458.0
 SMALL = Radio(samples_per_chirp=256, bandwidth_hz=320e6, chirps_per_frame=60)

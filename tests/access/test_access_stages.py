@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from isac_rt.access import protocol
-from isac_rt.access.ook import Message, Reading, keyed
-from isac_rt.access.protocol import Clock, Network, establish
-from isac_rt.access.synchronise import EXTERNAL
+from isac_rt.extensions.access import protocol
+from isac_rt.extensions.access.ook import Message, Reading, keyed
+from isac_rt.extensions.access.protocol import Network, establish
+from isac_rt.extensions.access.synchronise import EXTERNAL
 from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.clock import Clock
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform

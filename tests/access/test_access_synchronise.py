@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.access.synchronise import ClockEstimate, Round, estimate_clock, round_of
+from isac_rt.extensions.access.synchronise import ClockEstimate, Round, estimate_clock, round_of
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import unmodulated

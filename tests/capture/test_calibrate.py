@@ -12,7 +12,8 @@ import pytest
 import scipy.io
 from synthetic import C, channels, write_ti
 
-from isac_rt.capture.calibrate import (
+from isac_rt.cli.cli import main
+from isac_rt.extensions.hardware.calibrate import (
     KEY,
     PARTS,
     apply,
@@ -20,11 +21,10 @@ from isac_rt.capture.calibrate import (
     load_calibration,
     save_calibration,
 )
-from isac_rt.capture.description import Description
-from isac_rt.capture.explain import unexplained_by
-from isac_rt.capture.readers import import_file, waveform_described
-from isac_rt.capture.types import Capture, CaptureError, measured_folder
-from isac_rt.cli.cli import main
+from isac_rt.extensions.hardware.description import Description
+from isac_rt.extensions.hardware.explain import unexplained_by
+from isac_rt.extensions.hardware.readers import import_file, waveform_described
+from isac_rt.extensions.hardware.types import Capture, CaptureError, measured_folder
 from isac_rt.frame.antennas import Antennas, ti_cascade
 from isac_rt.frame.cube import IFCube
 from isac_rt.storage import load_data, save_data

@@ -16,8 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from synthetic import channels, write_ti
 
-from isac_rt.capture.description import load_description
-from isac_rt.capture.readers import import_file
+from isac_rt.extensions.hardware.description import load_description
+from isac_rt.extensions.hardware.readers import import_file
 from isac_rt.runtime import UserError
 
 EXAMPLES = int(os.environ.get("FUZZ", "60"))

@@ -16,13 +16,13 @@ import pytest
 import scipy.io
 from synthetic import channels, write_ti
 
-from isac_rt.capture.description import Description, load_description
-from isac_rt.capture.matfile import MOST_BYTES, read_mat
-from isac_rt.capture.readers import import_file
-from isac_rt.capture.store import load_capture, save_capture
-from isac_rt.capture.types import CaptureError
 from isac_rt.cli.cli import main
 from isac_rt.document import ScenarioError
+from isac_rt.extensions.hardware.description import Description, load_description
+from isac_rt.extensions.hardware.matfile import MOST_BYTES, read_mat
+from isac_rt.extensions.hardware.readers import import_file
+from isac_rt.extensions.hardware.store import load_capture, save_capture
+from isac_rt.extensions.hardware.types import CaptureError
 from isac_rt.results.files import ResultsError
 
 FRAMES, LOOPS, CHIRPS, RX, SIZE = 2, 3, (0, 2, 1), 4, 16
@@ -427,7 +427,7 @@ def test_what_unfolds_with_nothing_left_is_refused_before_it_does(tmp_path, monk
     """An array that takes exactly what may be unfolded, and after it what unfolds to 16 MiB: for
     zlib no byte left was no limit."""
     most = 2**16
-    monkeypatch.setattr("isac_rt.capture.matfile.MOST_BYTES", most)
+    monkeypatch.setattr("isac_rt.extensions.hardware.matfile.MOST_BYTES", most)
     count = most // 16
     whole = matrix(6, (count, 1), [element(9, bytes(8 * count))])
     (tmp_path / "x.mat").write_bytes(mat(whole, element(15, zlib.compress(bytes(2**24), 9))))

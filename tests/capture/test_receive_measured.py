@@ -7,11 +7,11 @@ import pytest
 import xarray as xr
 from synthetic import C, channels, write_ti
 
-from isac_rt.capture.description import Description
-from isac_rt.capture.readers import import_file
-from isac_rt.capture.sense import range_azimuth, sense
-from isac_rt.capture.types import CaptureError
 from isac_rt.cli.cli import main
+from isac_rt.extensions.hardware.description import Description
+from isac_rt.extensions.hardware.readers import import_file
+from isac_rt.extensions.hardware.sense import range_azimuth, sense
+from isac_rt.extensions.hardware.types import CaptureError
 from isac_rt.receive.settings import Receivers
 
 RATE, SLOPE, SIZE, LOOPS, AGAIN = 5e6, 40e12, 64, 16, 60e-6

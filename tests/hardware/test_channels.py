@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from isac_rt.extensions.hardware.channels import Elements as Errors
+from isac_rt.extensions.hardware.channels import elements_of
 from isac_rt.frame.antennas import Antennas
-from isac_rt.hardware.channels import Elements as Errors
-from isac_rt.hardware.channels import elements_of
-from isac_rt.hardware.settings import Elements
+from isac_rt.frame.front_end import Elements
 
 C = 299_792_458.0
 WAVE = C / 77e9

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.hardware.converter import converter_of, saturated, watts
-from isac_rt.hardware.settings import Converter
-from isac_rt.signal.chain import Work, finish
+from isac_rt.extensions.hardware.chain import Work, finish
+from isac_rt.extensions.hardware.converter import converter_of, saturated, watts
+from isac_rt.frame.front_end import Converter
 
 TURNS = (5**0.5 - 1) / 10  # no sine that comes round soon
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.signal import welch
 
-from isac_rt.hardware.oscillator import Mask, Oscillator, Record, _between, cubic, spread
-from isac_rt.signal.chain import add_phases
+from isac_rt.extensions.hardware.chain import add_phases
+from isac_rt.extensions.hardware.oscillator import Mask, Oscillator, Record, _between, cubic, spread
 
 RATE = 20e6
 SLOT = 64.8e-6

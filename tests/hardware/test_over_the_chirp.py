@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.hardware.settings import Response
-from isac_rt.hardware.sweep import READ_ERROR, Ramp, read_at, response_of, short_read
+from isac_rt.extensions.hardware.sweep import READ_ERROR, Ramp, read_at, response_of, short_read
+from isac_rt.frame.front_end import Response
 
 
 def test_tables_are_decibels_and_degrees():

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.hardware.settings import FrontEnd, Shifter
-from isac_rt.hardware.shifter import shifter_of
+from isac_rt.extensions.hardware.shifter import shifter_of
+from isac_rt.frame.front_end import FrontEnd, Shifter
 
 
 @pytest.mark.parametrize("bits", [2, 3, 5])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.capture.store import load_cube, save_cube
+from isac_rt.extensions.hardware.store import load_cube, save_cube
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import unmodulated

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.hardware.settings import FrontEnd
+from isac_rt.frame.front_end import FrontEnd
 from reproduce import front_ends, hardware
 
 

@@ -6,7 +6,7 @@ import pytest
 from pydantic import ValidationError
 
 from isac_rt.document import ScenarioError
-from isac_rt.hardware.settings import FrontEnd, Oscillator
+from isac_rt.frame.front_end import FrontEnd, Oscillator
 from isac_rt.scenario.file import load, to_yaml
 from isac_rt.scenario.tree import Scenario
 

@@ -23,8 +23,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_fuzz import JUNK, PROFILE, broken, one_message
 
-from isac_rt.capture.readers import read_sigmf
-from isac_rt.capture.store import load_cube, save_cube
+from isac_rt.extensions.hardware.readers import read_sigmf
+from isac_rt.extensions.hardware.store import load_cube, save_cube
 from isac_rt.frame.cube import IFCube
 from isac_rt.propagation.store import PathStore
 from isac_rt.results.files import ResultsError, open_results, save, write_dataset

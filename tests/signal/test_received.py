@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from test_ifsignal import SMALL, START, antennas, paths, pose, sender
 
+from isac_rt.extensions.hardware.channels import elements_of
+from isac_rt.extensions.hardware.converter import converter_of
+from isac_rt.extensions.hardware.front_end import IDEAL, Ends, FrontEnd
+from isac_rt.extensions.hardware.oscillator import Mask, Oscillator, spread
+from isac_rt.extensions.hardware.received import received
+from isac_rt.extensions.hardware.sweep import Ramp, response_of, short_read
+from isac_rt.frame import front_end as scenario
 from isac_rt.frame.cube import ReceiveArray, Reference
-from isac_rt.hardware import settings as scenario
-from isac_rt.hardware.channels import elements_of
-from isac_rt.hardware.converter import converter_of
-from isac_rt.hardware.front_end import IDEAL, Ends, FrontEnd
-from isac_rt.hardware.oscillator import Mask, Oscillator, spread
-from isac_rt.hardware.sweep import Ramp, response_of, short_read
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Direct, Exact, Gridded
 from isac_rt.signal.noise import WhiteNoise
-from isac_rt.signal.received import received
 
 SILENT = WhiteNoise(0.0, np.zeros(2, np.uint32))
 LOUD = Mask(((1e4, -60.0), (1e7, -90.0)))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import isac_rt as irt
-from isac_rt.capture.calibrate import save_calibration
-from isac_rt.capture.types import Capture, CaptureError
 from isac_rt.document import ScenarioError
+from isac_rt.extensions.hardware.calibrate import save_calibration
+from isac_rt.extensions.hardware.types import Capture, CaptureError
 from isac_rt.results.provenance import path_content, run_content
 from isac_rt.scenario.file import to_yaml
 

@@ -7,8 +7,8 @@ import pytest
 from talking import scenario
 from test_resume import Stopped, assert_equal_results, stopping_at
 
-from isac_rt.access.settings import Access
 from isac_rt.extensions.cooperation.swarm import look_of
+from isac_rt.frame.access import Access
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers

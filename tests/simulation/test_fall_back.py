@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isac_rt.access.fall_back import Schedules
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.settings import Array, Modulation, Noise
 from isac_rt.frame.waveform import Waveform
@@ -19,6 +18,7 @@ from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
+from isac_rt.simulation.fall_back import Schedules
 from isac_rt.views.report import write_report
 
 COUNT = 9

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from isac_rt.access.feedback import Correction
-from isac_rt.access.protocol import Establishment
-from isac_rt.access.settings import Access
+from isac_rt.extensions.access.feedback import Correction
+from isac_rt.extensions.access.protocol import Establishment
+from isac_rt.frame.access import Access
 from isac_rt.frame.link import Link
 from isac_rt.frame.settings import Array, Modulation, Noise
 from isac_rt.propagation.settings import Propagation

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from isac_rt.capture.calibrate import PARTS, Calibration, calibrate
-from isac_rt.capture.description import Description
-from isac_rt.capture.explain import unexplained_by
-from isac_rt.capture.matfile import read_mat
-from isac_rt.capture.readers import import_file
-from isac_rt.capture.types import MEASURED, Capture, measured_folder, ti_window
+from isac_rt.extensions.hardware.calibrate import PARTS, Calibration, calibrate
+from isac_rt.extensions.hardware.description import Description
+from isac_rt.extensions.hardware.explain import unexplained_by
+from isac_rt.extensions.hardware.matfile import read_mat
+from isac_rt.extensions.hardware.readers import import_file
+from isac_rt.extensions.hardware.types import MEASURED, Capture, measured_folder, ti_window
 from isac_rt.frame.antennas import Antennas
-from isac_rt.hardware.settings import FrontEnd
+from isac_rt.frame.front_end import FrontEnd
 from isac_rt.propagation.rcs import SMALL_MEAN_DBSM, TR38901_STD_DB
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import Conventional, doppler_bins

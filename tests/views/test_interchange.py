@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from isac_rt.capture.readers import read_sigmf
-from isac_rt.capture.store import cube_dataset, load_cube, save_cube
+from isac_rt.extensions.hardware.readers import read_sigmf
+from isac_rt.extensions.hardware.store import cube_dataset, load_cube, save_cube
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
 from isac_rt.frame.settings import Array, Modulation, Noise

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from isac_rt.frame import front_end as settings
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
-from isac_rt.hardware import settings
 from isac_rt.randomness import generator
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from isac_rt.capture.types import Capture, CaptureError, ti_window
+from isac_rt.extensions.hardware.types import Capture, CaptureError, ti_window
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.runtime import shortly

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+from isac_rt.extensions.hardware.channels import Elements, elements_of
+from isac_rt.extensions.hardware.converter import Converter, converter_of, watts
+from isac_rt.extensions.hardware.oscillator import Oscillator, oscillator_of
+from isac_rt.extensions.hardware.shifter import Shifter, shifter_of
+from isac_rt.extensions.hardware.sweep import Ramp, Response, ramp_of, response_of
+from isac_rt.frame import front_end as settings
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
-from isac_rt.hardware import settings
-from isac_rt.hardware.channels import Elements, elements_of
-from isac_rt.hardware.converter import Converter, converter_of, watts
-from isac_rt.hardware.oscillator import Oscillator, oscillator_of
-from isac_rt.hardware.shifter import Shifter, shifter_of
-from isac_rt.hardware.sweep import Ramp, Response, ramp_of, response_of
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.capture.description import MOST_ELEMENTS, Description
-from isac_rt.capture.matfile import read_mat
-from isac_rt.capture.store import checked_cube
-from isac_rt.capture.types import Capture, CaptureError, ti_window
+from isac_rt.extensions.hardware.description import MOST_ELEMENTS, Description
+from isac_rt.extensions.hardware.matfile import read_mat
+from isac_rt.extensions.hardware.store import checked_cube
+from isac_rt.extensions.hardware.types import Capture, CaptureError, ti_window
 from isac_rt.frame.antennas import Antennas, ti_cascade
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Sweep, Waveform

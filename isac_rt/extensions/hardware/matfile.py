@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from isac_rt.capture.types import CaptureError
+from isac_rt.extensions.hardware.types import CaptureError
 from isac_rt.runtime import shortly
 from isac_rt.storage import BAD_DATA, check_unfolded, read_whole
 

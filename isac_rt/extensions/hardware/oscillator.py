@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.fft
 
-from isac_rt.hardware import settings
+from isac_rt.frame import front_end as settings
 from isac_rt.randomness import generator
 
 SLOWEST = 0.1

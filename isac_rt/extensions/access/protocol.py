@@ -26,10 +26,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from isac_rt.access.identify import choose_run, consensus, hot_chirps, needed_chirps
-from isac_rt.access.ook import Codebook, Message, keyed, read
-from isac_rt.access.synchronise import EXTERNAL, ClockEstimate, Round, estimate_clock, round_of
+from isac_rt.extensions.access.identify import choose_run, consensus, hot_chirps, needed_chirps
+from isac_rt.extensions.access.ook import Codebook, Message, keyed, read
+from isac_rt.extensions.access.synchronise import (
+    EXTERNAL,
+    ClockEstimate,
+    Round,
+    estimate_clock,
+    round_of,
+)
 from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.clock import Clock
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.link import Link
 from isac_rt.frame.payload import random_payload, unmodulated
@@ -43,6 +50,7 @@ from isac_rt.receive.types import Detections
 from isac_rt.signal.if_signal import noisy_if_signal
 from isac_rt.signal.methods import Auto
 from isac_rt.signal.noise import WhiteNoise
+from isac_rt.simulation.setup import Setup
 from isac_rt.world.swarm import Pose
 
 Scene = Callable[[float, list[Link]], tuple[Mapping[str, Pose], Mapping[Link, PathSet]]]
@@ -53,18 +61,6 @@ HOLD_SHARE = 0.125
 numbers)."""
 BLOCK_FALSE_RATE = 1e-4
 """Chance that noise makes a free block look taken."""
-
-
-@dataclass(frozen=True)
-class Clock:
-    """A terminal's clock against true time: it shows t + offset + drift t, and what it sends is
-    late by that [s, 1]."""
-
-    offset: float = 0.0
-    drift: float = 0.0
-
-    def late(self, time: float) -> float:
-        return self.offset + self.drift * time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -449,3 +445,35 @@ def _acknowledge(
                 out.add(pt)
         air.frame += 1
     return out
+
+
+def establish_links(setup: Setup, clocks: Mapping[str, Clock]) -> Establishment:
+    """Run the stages before the data in a run's scene; the last of their frames ends by the first
+    of the run's."""
+    s, timetable = setup.scenario, setup.timetable
+    active, passive = (
+        [n for n, u in s.swarm.items() if u.role == r] for r in ("active", "passive")
+    )
+
+    def scene(when: float, links: list[Link]) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
+        poses = setup.swarm.poses(when)
+        return poses, setup.propagation.trace(poses, when, links).paths if links else {}
+
+    first = setup.swarm.poses(timetable.epoch(0))
+    network = Network(
+        waveform=setup.waveform,
+        antennas=setup.antennas,
+        schedule=setup.schedule,
+        receivers=s.receivers,
+        scene=scene,
+        wishes=s.first_blocks(),
+        listeners={name: tuple(passive) for name in active},
+        noise_power={name: setup.noise_power(first, Link(name, name)) for name in active}
+        | {name: setup.noise_power(first, Link(active[0], name)) for name in passive},
+        seed=s.seed,
+        clocks=clocks,
+        amplitude=setup.plan.amplitude,
+        external_clock=s.access.synchronisation != "two_round",
+        dpsk_order=s.modulation.dpsk_order,
+    )
+    return establish(replace(network, start=-network.longest))

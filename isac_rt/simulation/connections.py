@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from isac_rt.access.protocol import Clock, Establishment
+from isac_rt.frame.clock import Clock
 from isac_rt.frame.link import Link
 
 
@@ -17,12 +17,13 @@ class Connections:
     Attributes
     ----------
     clocks : of every terminal against true time; empty where an external source keeps them equal
-    establishment : outcome of the stages before the data; None when they were left out, and
+    establishment : outcome of the stages before the data
+        (`isac_rt.extensions.access.protocol.Establishment`); None when they were left out, and
         everything is as stated
     """
 
     clocks: Mapping[str, Clock] = field(default_factory=dict)
-    establishment: Establishment | None = None
+    establishment: Any = None
 
     @property
     def refused(self) -> frozenset[Link]:

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from pydantic import TypeAdapter
 
-from isac_rt.capture.types import Capture
+from isac_rt.extensions.hardware.types import Capture
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from isac_rt.capture.types import Capture, CaptureError
+from isac_rt.extensions.hardware.types import Capture, CaptureError
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import SPEED_OF_LIGHT

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isac_rt.hardware import settings
+from isac_rt.frame import front_end as settings
 
 _AT_ONE_DB = np.sqrt(10**0.2 - 1)  # power over the saturation's where the gain is 1 dB lower
 

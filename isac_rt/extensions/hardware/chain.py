@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isac_rt.hardware.oscillator import OVERSAMPLING, Record, cubic
+from isac_rt.extensions.hardware.oscillator import OVERSAMPLING, Record, cubic
 from isac_rt.signal.noise import SILENCE, WhiteNoise, add_stream
 
 MAX_DRIVE = np.float32(1e15)
@@ -109,9 +109,9 @@ class Work:
     Attributes
     ----------
     taps, shift : (1 + T, 2) and (N,), with which samples are read at places nearby
-        (`isac_rt.hardware.sweep.short_read`); None: they are not
+        (`isac_rt.extensions.hardware.sweep.short_read`); None: they are not
     reads, first : (T, N) weights with which samples are read farther away; the first of the
-        neighbours (`isac_rt.hardware.sweep.read_at`); None: they are not
+        neighbours (`isac_rt.extensions.hardware.sweep.read_at`); None: they are not
     margin : samples that a chirp has besides, before and behind, for those that are read there
     turns : of each chirp; by its `beat` samples are turned back before they are read, their band to
         the middle

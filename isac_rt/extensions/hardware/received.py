@@ -12,8 +12,8 @@ at every sample. It is applied in three parts:
 - by sample to those paths alone whose noise within a chirp, P times its variance, would be more
   than `SHARE` of the thermal noise; at most `MOST_ALONE`, the strongest.
 
-What is left out is a path's noise within a chirp beyond that of tau_0 (`isac_rt.hardware.oscillator
-.spread` is its variance), and the difference of the mean within a bin of delay.
+What is left out is a path's noise within a chirp beyond that of tau_0 (`oscillator.spread` is its
+variance), and the difference of the mean within a bin of delay.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from functools import lru_cache
 
 import numpy as np
 
+from isac_rt.extensions.hardware.chain import Turns, Work, add_phases, finish, phasors, places_of
+from isac_rt.extensions.hardware.converter import saturated
+from isac_rt.extensions.hardware.front_end import IDEAL, Ends
+from isac_rt.extensions.hardware.oscillator import Mask, Oscillator, Record, spread
+from isac_rt.extensions.hardware.sweep import Ramp, read_at, sampled, short_read
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
 from isac_rt.frame.schedule import codes_of
 from isac_rt.frame.waveform import Sweep, Waveform
-from isac_rt.hardware.converter import saturated
-from isac_rt.hardware.front_end import IDEAL, Ends
-from isac_rt.hardware.oscillator import Mask, Oscillator, Record, spread
-from isac_rt.hardware.sweep import Ramp, read_at, sampled, short_read
 from isac_rt.kernels.signal_direct import add_direct
-from isac_rt.signal.chain import Turns, Work, add_phases, finish, phasors, places_of
 from isac_rt.signal.if_signal import heard
 from isac_rt.signal.methods import Method
 from isac_rt.signal.noise import WhiteNoise

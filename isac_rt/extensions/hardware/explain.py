@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from isac_rt.capture.calibrate import PARTS, Calibration, board, near_spectra
-from isac_rt.capture.types import Capture, CaptureError
+from isac_rt.extensions.hardware.calibrate import PARTS, Calibration, board, near_spectra
+from isac_rt.extensions.hardware.types import Capture, CaptureError
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import unmodulated

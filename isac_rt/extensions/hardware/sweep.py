@@ -21,8 +21,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from isac_rt.frame import front_end as settings
 from isac_rt.frame.waveform import Waveform
-from isac_rt.hardware import settings
 from isac_rt.randomness import generator
 
 

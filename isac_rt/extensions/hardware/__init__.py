@@ -1,0 +1,1 @@
+"""Real hardware: front ends and their samples, recordings of boards, and their calibration."""
