@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from access.test_access_run import run as access_run
+from extensions.access.test_access_run import run as access_run
 from simulation.test_fall_back import scenario as dense
 from talking import scenario as talking
 

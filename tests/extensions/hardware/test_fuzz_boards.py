@@ -1,5 +1,5 @@
 """Files of radar boards, bent at random: a capture of finite samples or one message, never a
-traceback or a hang. FUZZ=2000 pytest tests/capture/test_fuzz_boards.py looks further."""
+traceback or a hang. FUZZ=2000 pytest test_fuzz_boards.py looks further."""
 
 from __future__ import annotations
 
