@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from isac_rt.extensions.access import feedback, protocol
 from isac_rt.extensions.access.feedback import Correction
 from isac_rt.extensions.access.protocol import Establishment
 from isac_rt.frame.access import Access
@@ -18,7 +19,6 @@ from isac_rt.receive.types import Reception, no_detections
 from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
-from isac_rt.simulation import setup as setting_up
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import Setup, prepare
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
@@ -142,7 +142,7 @@ def test_feedback_goes_to_the_links_own_active_terminal(monkeypatch):
         cells = 3 if clock[0] == ("B", "P") else 0
         return None if clock[0] == ("A", "Q") else Correction(cells, 1.0, True)
 
-    monkeypatch.setattr(simulate, "exchange", exchange)
+    monkeypatch.setattr(feedback, "exchange", exchange)
     run = simulate.run(
         replace_receivers(s, active_every_frames=2), snapshots=0, terminal=kept.terminal, threads=1
     )
@@ -184,7 +184,7 @@ def test_the_stages_before_the_data_are_given_the_scenario(monkeypatch):
         told.append(network)
         return Establishment({"A": 0, "B": None}, {}, {}, {}, 0, 0, 0, 0, 1, 0.1)
 
-    monkeypatch.setattr(setting_up, "establish", establish)
+    monkeypatch.setattr(protocol, "establish", establish)
     access = Access(establish=True, synchronisation="two_round")
     s = scenario(swarm=drifting, access=access, modulation=Modulation(acquisition_frames=2))
     setup = prepare(s)
