@@ -247,7 +247,7 @@ MAX_LINES = {
     "results": 3450,
     "simulation": 3400,
     "sweep": 2350,
-    "views": 3060,
+    "views": 3040,
     "cli": 2100,
     "extensions": 10300,
 }

@@ -53,7 +53,7 @@ def say_table(
                 title = title if wide else title.replace(" ", "\n")
                 found.add_column(title, justify="right", no_wrap=True)
             else:
-                found.add_column(title, overflow="fold", no_wrap=wide)
+                found.add_column(title, overflow="fold", no_wrap=wide, min_width=9)
         for row in rows:
             found.add_row(*row)
         return found

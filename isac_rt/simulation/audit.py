@@ -258,7 +258,7 @@ def _mirrors_item(record: dict[str, dict[str, Any]] | None) -> Item:
     sent on."""
     what = "clutter by mirrors"
     if record is None:
-        return Item(what, "none: one bounce", "two bounces; clutter.mirrors adds them")
+        return Item(what, "one bounce", "two bounces (clutter.mirrors)")
     counts = ", ".join(f"{row['count']} of {name}" for name, row in record.items())
     shares = [100 * row["share"] for row in record.values()]
     kept = " to ".join(dict.fromkeys(f"{share:.2g}" for share in (min(shares), max(shares))))
@@ -279,10 +279,10 @@ def _link_items(setup: Setup, link: Link, uses: list[Use]) -> list[Item]:
     }
     kinds = dict.fromkeys(kind for use in uses for kind in use.kept)
     kept = ", ".join(
-        f"{np.mean([use.kept.get(k, 0) for use in uses]):.3g} {k.replace('_', ' ')}" for k in kinds
+        f"{np.mean([use.kept.get(k, 0) for use in uses]):,.0f} {k.replace('_', ' ')}" for k in kinds
     )
-    said = f"{kept or 'none'}; up to {max(use.bounces for use in uses)} bounces"
-    gone = f"{mean['weak']:.3g} too weak, {mean['unheard']:.3g} out of reach"
+    said = f"{kept or 'none'}; bounces: {max(use.bounces for use in uses)} at most"
+    gone = f"{mean['weak']:,.0f} too weak, {mean['unheard']:,.0f} out of reach"
     left = decibels(min(POWER_MARGIN * max(use.left_out for use in uses), setup.plan.weakest))
     num_kept = max(mean["found"] - mean["unheard"] - mean["weak"], 1.0)
 
@@ -296,24 +296,24 @@ def _link_items(setup: Setup, link: Link, uses: list[Use]) -> list[Item]:
         Item("paths", said, gone, left, "dB", name),
         Item(
             "wavefronts",
-            f"{num_kept - plane:.3g} spherical",
-            f"{plane:.3g} taken as plane",
+            f"{num_kept - plane:,.0f} spherical",
+            f"curvature of {plane:,.0f}",
             phase(use.plane_error for use in uses),
             "rad",
             name,
         ),
         Item(
             "flight in a frame",
-            f"{num_kept - straight:.3g} accelerated",
-            f"{straight:.3g} taken as straight",
+            f"{num_kept - straight:,.0f} accelerated",
+            f"acceleration of {straight:,.0f}",
             phase(use.straight_error for use in uses),
             "rad",
             name,
         ),
         Item(
             "directions in a frame",
-            "as at mid-frame",
-            "that they turn",
+            "those at mid-frame",
+            "rotation within the frame",
             PHASE_MARGIN * max(use.turning_error for use in uses),
             "rad",
             name,

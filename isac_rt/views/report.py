@@ -14,28 +14,9 @@ import xarray as xr
 from isac_rt.results.recorder import Results
 from isac_rt.runtime import MissingPackage
 from isac_rt.storage import write_whole
+from isac_rt.views import tables
 from isac_rt.views.scene import MOST_LINES, moving_scene, page_part
-from isac_rt.views.tables import (
-    DASH,
-    Table,
-    city_costs,
-    coverage_tables,
-    data_table,
-    error_table,
-    false_table,
-    flat,
-    hit_table,
-    legend,
-    link_words,
-    loss_table,
-    number,
-    rmse_table,
-    row_table,
-    side_by_side,
-    swarm_table,
-    target_table,
-    timing_table,
-)
+from isac_rt.views.tables import DASH, Table, flat, link_words, number, row_table
 from isac_rt.views.walls import MOST_WALLS, walls
 from isac_rt.world.city.mesh import CityMesh
 
@@ -105,19 +86,9 @@ def write_report(
         roles=", ".join(f"{roles.count(r)} {r}" for r in dict.fromkeys(roles)),
         carrier=f"{radio.carrier_hz / 1e9:g} GHz",
         bandwidth=f"{radio.bandwidth_hz / 1e6:g} MHz",
-        legend=legend,
-        targets=[hit_table(s, "targets"), rmse_table(s, "targets")],
-        terminals=[hit_table(s, "terminals"), rmse_table(s, "terminals")],
-        data=data_table(s),
-        compared=side_by_side(s),
-        city_costs=city_costs(s),
-        sees=coverage_tables(json.loads(d.attrs["coverage"])) if "coverage" in d.attrs else None,
-        false_tracks=false_table(s),
-        swarm=swarm_table(s),
-        uavs=target_table(s),
-        errors=error_table(s),
+        tables=tables,
+        coverage=json.loads(d.attrs.get("coverage", "null")),
         walls=wall_table(d, city) if city is not None and "det_face" in d else Table((), ()),
-        losses=loss_table(s),
         budget=row_table(
             [row | {"link": link_words(row["link"])} for row in json.loads(d.attrs["link_budget"])]
         ),
@@ -134,7 +105,6 @@ def write_report(
         ),
         fidelity=Table(("Part", "Model"), flat(s["fidelity"])),
         materials=row_table([{"material": name, **values} for name, values in materials.items()]),
-        timing=timing_table(s["timing_s"]),
         versions=Table(
             ("Package", "Version"),
             [

@@ -228,7 +228,7 @@ def scene_3d(
             traces.append(_line(lines_of(lines), KIND_COLOURS[name], 3, label, **shown))
     roles = [uav.role for uav in swarm.uavs.values()]
     traces.append(_uavs(names, roles, np.array([poses[name].position for name in names])))
-    return go.Figure(traces, around)
+    return go.Figure(traces, around | {"template": "plotly_white"})
 
 
 def write_page(figure: Figure, file: str | Path) -> None:

@@ -207,15 +207,23 @@ def link_words(name: str) -> str:
 
 _COVERAGE = {
     "Max range [m]": "max_range_m",
-    "Range resolution [m]": "range_resolution_m",
+    "Range cell [m]": "range_resolution_m",
     "Max velocity [m/s]": "max_velocity_mps",
-    "Velocity resolution [m/s]": "velocity_resolution_mps",
-    "Azimuth beamwidth [deg]": "azimuth_resolution_deg",
-    "Elevation beamwidth [deg]": "elevation_resolution_deg",
+    "Velocity cell [m/s]": "velocity_resolution_mps",
+    "Azimuth beam [deg]": "azimuth_resolution_deg",
+    "Elevation beam [deg]": "elevation_resolution_deg",
     "Field of view [deg]": "field_of_view_deg",
     "Bit rate [kbit/s]": "bit_rate_bps",
 }
 _OUTSIDE = ("out_of_view", "beyond_range", "too_near", "too_fast")
+
+
+def _filled(table: Table) -> Table:
+    """A table without its columns of dashes alone."""
+    columns = zip(table.columns, *table.rows, strict=True)
+    kept = [column for column in columns if set(column[1:]) != {DASH}]
+    titles, *rows = zip(*kept, strict=True)
+    return Table(titles, rows)
 
 
 def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
@@ -235,9 +243,8 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
         alike.setdefault(tuple(number(row[key]) for key in _COVERAGE.values()), []).append(
             link_words(of["link"])
         )
-    limits = Table(
-        ("Coverage", *_COVERAGE), [(", ".join(names), *row) for row, names in alike.items()]
-    )
+    rows = [(", ".join(names), *row) for row, names in alike.items()]
+    limits = _filled(Table(("Coverage", *_COVERAGE), rows))
     farthest = max(seen["links"], key=lambda of: of["max_range_m"])
     slot, frame, interval = (
         number(seen[key] * unit)
@@ -249,8 +256,8 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
     words = (
         f"A slot (one chirp of each group) lasts {slot} us, a frame {frame} ms, and one starts "
         f"every {interval} ms. Range: one way for echoes, path length between two terminals{past}. "
-        "Faster UAVs alias in velocity. Beamwidth: of the array's main lobe at boresight. Field of "
-        f"view: to each side; directions are unambiguous to "
+        "Faster UAVs alias in velocity. Beam: width of the array's main lobe at boresight. Field "
+        "of view: to each side; directions are unambiguous to "
         f"{number(farthest['unambiguous_angle_deg'])} deg. Occlusion is not considered here."
     )
     rows = [

@@ -193,10 +193,12 @@ def test_report_is_one_self_contained_page(run, written):
 
 
 @pytest.mark.parametrize("form", ["svg", "pdf"])
-def test_figures_for_a_paper(run, tmp_path, form, capsys):
+def test_figures_for_a_paper(run, tmp_path, form, capsys, monkeypatch):
     """Both columns or one, fonts of print, the same bytes twice: nothing of the clock is in them.
     Planted bug: a PDF's date left in."""
     save(run, tmp_path)
+    drawings = [d for d in figures._all(run.dataset, None, True) if d.name in ("scene", "errors")]
+    monkeypatch.setattr(figures, "_all", lambda *_: drawings)
     made = []
     for where in ("a", "b"):
         command = ["figures", str(tmp_path), "--as", form, "--style", "column"]
@@ -256,7 +258,7 @@ def complaints(figure: Figure) -> list[str]:
     return out
 
 
-@pytest.mark.parametrize("style", figures.STYLES)
+@pytest.mark.parametrize("style", ["wide", "column"])
 def test_no_text_covers_another_or_is_cut_off(run, style):
     """Planted bugs: a title of a hundred letters; titles over a legend; an axis's label longer than
     the axis."""
