@@ -8,7 +8,6 @@ from twins import assert_twins_agree
 
 from isac_rt.kernels.jit import TWINS
 from isac_rt.propagation.clutter import cells
-from isac_rt.propagation.clutter import merging as _merging  # noqa: F401  # has a twin
 from isac_rt.propagation.clutter.field import Rows, Surfaces
 
 
@@ -176,64 +175,3 @@ def test_cells_of_a_surface():
     assert_twins_agree(name, *arguments, 100_000, rtol=1e-14)
     assert TWINS[name][1](*arguments, 100_000)[0] > 1_000
     assert [f(*arguments, 900)[0] for f in TWINS[name]] == [901, 901]
-
-
-def test_halves_of_cells_that_merge():
-    """Trees of halvings of 30 faces with cells left out, and limits under and over what merges.
-    Planted bugs: the larger of two limits; the half that rings last stands for both."""
-    rng = np.random.default_rng(13)
-    rows = []
-    for face in range(30):
-        waiting = [1]
-        while waiting:
-            code = waiting.pop()
-            if code < 2**9 and rng.random() < 0.8:
-                waiting += [2 * code + 1, 2 * code]
-            elif rng.random() < 0.85:
-                rows.append((face, code))
-    face, code = np.array(rows).T
-    halvings = np.frexp(code.astype(float))[1] - 1
-    area = (7.3 / 2.0**halvings).astype(np.float32)
-    amplitude = (rng.normal(size=(2, len(area))) * [[1], [1j]]).sum(axis=0).astype(np.complex64)
-    clock, limit = rng.exponential(size=len(area)) / area, area * rng.exponential(30, len(area))
-    each = face.astype(np.int32), code.astype(np.uint64), halvings, area, amplitude, clock, limit
-    name = "isac_rt.propagation.clutter.merging.merged"
-    assert_twins_agree(name, *each, rtol=1e-6)  # amplitudes are complex64
-    place, *_ = TWINS[name][1](*each)
-    assert 0.2 * len(area) < len(place) < 0.8 * len(area)
-
-
-@pytest.mark.sionna
-@pytest.mark.parametrize("before", [True, False])
-def test_ways_over_a_mirror_and_a_scatterer(before):
-    """The geometry, then the gains, one way up and down at normal incidence on the mirror. Planted
-    bugs: TE and TM of the mirror exchanged; the direction at the terminal not mirrored."""
-    import isac_rt.propagation.clutter.two_bounces  # noqa: F401  # has the twins
-
-    rng = np.random.default_rng(14)
-    count, faces = 301, 23
-    normals = rng.normal(size=(faces, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    surfaces = Surfaces(
-        normals,
-        rng.integers(0, 3, faces),
-        rng.uniform(0.1, 0.9, (3, 33, 3)),
-        rng.uniform(0.1, 0.4, 3),
-        np.array([-1.0, 0.7, 1.0]),
-        np.array([1.0, 4.0, 9.0]),
-    )
-    points, normal = rng.uniform(-40, 40, (count, 3)), np.array([0.6, 0.64, 0.48])
-    start, end = (rng.normal(size=(3, 3)) * [[30], [12], [3]] for _ in range(2))
-    points[0] = (start[0] if before else end[0]) + 17.3 * normal
-    arrays = [np.zeros(count, dtype) for dtype in (float, float, np.float32, float, float)]
-    cell = np.arange(count, dtype=np.int32)
-    ends = np.zeros((count, 3)), np.zeros((count, 3))
-    rows = Rows(*arrays, *ends, cell, np.zeros(count, np.float32))
-    room = "isac_rt.propagation.clutter.two_bounces"
-    geometry = points, normal, start, end, before, rows
-    assert_twins_agree(f"{room}.lay_out", *geometry, rtol=2e-7)  # accelerations are float32
-    TWINS[f"{room}.lay_out"][1](*geometry)
-    slab = tuple(rng.normal(size=(2, count)) + 1j * rng.normal(size=(2, count)))
-    each = rng.integers(0, faces, count), rng.uniform(0.1, 2, count), rng.uniform(0, 1, count)
-    rest = normal, slab, before, rows, np.zeros(count, complex)
-    assert_twins_agree(f"{room}.weigh", surfaces, *each, 0.37, *rest, rtol=1e-12)

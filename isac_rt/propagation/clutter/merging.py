@@ -36,8 +36,6 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
-from isac_rt.kernels import propagation_merging
-from isac_rt.kernels.jit import twin_of
 from isac_rt.propagation.clutter.cells import Cells
 
 FEWEST = 6
@@ -191,7 +189,6 @@ def merge(cells: Cells, limit: np.ndarray) -> tuple[np.ndarray, Cells]:
     )
 
 
-@twin_of(propagation_merging.merged)
 def merged(
     face: np.ndarray,
     code: np.ndarray,
@@ -213,7 +210,8 @@ def merged(
         faces: by the last cell of what held it, the finest first
     """
     every = np.arange(len(area))
-    nodes = [face, code, every, area.astype(float), limit, np.sqrt(area) * amplitude, every]
+    sums = (np.sqrt(area) * amplitude).astype(complex)
+    nodes = [face, code, every, area.astype(float), limit, sums, every]
     waiting, left = [part[:0] for part in nodes], []
     for level in range(halvings.max(initial=0), -1, -1):
         waiting = [

@@ -28,8 +28,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
-from isac_rt.kernels import propagation_two_bounces
-from isac_rt.kernels.jit import twin_of
 from isac_rt.propagation.clutter.field import (
     ClutterField,
     Rows,
@@ -257,7 +255,6 @@ class TwoBounces:
         )
 
 
-@twin_of(propagation_two_bounces.lay_out)
 def lay_out(
     points: np.ndarray,
     normal: np.ndarray,
@@ -278,7 +275,6 @@ def lay_out(
     turned[:] = mirror_image(turned, normal)
 
 
-@twin_of(propagation_two_bounces.weigh)
 def weigh(
     surfaces: Surfaces,
     face: np.ndarray,
