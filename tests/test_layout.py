@@ -239,7 +239,7 @@ MAX_LINES = {
     "kernels": 4500,
     "frame": 2350,
     "world": 5775,
-    "propagation": 5130,
+    "propagation": 5100,
     "signal": 850,
     "receive": 6100,
     "track": 1850,

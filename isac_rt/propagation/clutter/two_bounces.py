@@ -23,16 +23,14 @@ Import only after `isac_rt.runtime.activate()`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.propagation.clutter.field import (
     ClutterField,
-    Rows,
     Seen,
-    Surfaces,
     motion_to,
     scattered_power,
 )
@@ -225,22 +223,52 @@ class TwoBounces:
             start = mirror.image(state.start)
         else:
             end = mirror.image(state.end)
-        count, c = index.size, self._field.cells
-        numbers = (np.empty(count, dtype) for dtype in (float, float, np.float32, float, float))
-        ends = np.empty((count, 3)), np.empty((count, 3))
-        rows = Rows._make([*numbers, *ends, index, np.empty(count, np.float32)])
-        lay_out(c.points, mirror.normal, start, end, before, rows)
-        met = rows.departure if before else rows.arrival
-        slab = slab_coefficients(
-            mirror.material, np.minimum(np.abs(met @ mirror.normal), 1.0), self._wavelength
-        )
-        gain, scale = np.empty(count, complex), self._wavelength / (4 * np.pi)
-        surfaces = self._field.surfaces
-        weigh(surfaces, c.face, c.area, share, scale, mirror.normal, slab, before, rows, gain)
-        rows.magnitude[:] = size = np.abs(gain)
+        there, back = (motion_to(self._field.cells.points[index], body) for body in (start, end))
+        length, rate, accel = (one + other for one, other in zip(there[:3], back[:3], strict=True))
+        # the terminal at the mirror's side sends to, or hears from, where its image does
+        departure, arrival = there[3], back[3]
+        if before:
+            departure = mirror_image(departure, mirror.normal)
+        else:
+            arrival = mirror_image(arrival, mirror.normal)
+        ends = there[0], back[0], departure, arrival
+        seen = Seen(length, rate, accel.astype(np.float32), *ends, index, share)
+        gain = share * self._gain(mirror, seen, before)
+        size = np.abs(gain)
         some = np.flatnonzero(size > 0)
         turn = (gain[some] / size[some]).astype(np.complex64)
-        return SeenByMirror(Seen(*(a[some] for a in rows)), turn, mirror, before)
+        seen = replace(seen, magnitude=size.astype(np.float32))
+        return SeenByMirror(Seen(*(a[some] for a in vars(seen).values())), turn, mirror, before)
+
+    def _gain(self, mirror: Mirror, seen: Seen, before: bool) -> np.ndarray:
+        """Complex gains (K,) of ways over scatterers that nothing hides; their own amplitudes are
+        left out.
+
+        The mirror passes the part of the vertical field that the receiving end takes as vertical;
+        the field that arrives at a scatterer says which share of its power is TE there.
+        """
+        normal, cells, surfaces = mirror.normal, self._field.cells, self._field.surfaces
+        away, home = seen.departure, -seen.arrival
+        face, area = cells.face[seen.index], cells.area[seen.index]
+        cosine = np.minimum(np.abs((away if before else home) @ normal), 1.0)
+        slab = slab_coefficients(mirror.material, cosine, self._wavelength)
+        u, w = (mirror_image(away, normal), home) if before else (away, mirror_image(home, normal))
+        if before:
+            field = mirrored_field(vertical(away), away, u, normal, *slab)
+            passed = (field * vertical(u)).sum(axis=1)
+        else:
+            field, mirrored = vertical(u), mirrored_field(vertical(w), w, home, normal, *slab)
+            passed = (mirrored * vertical(home)).sum(axis=1)
+        n = surfaces.normals[face]
+        into, back = (u * n).sum(axis=1), -(w * n).sum(axis=1)
+        across = np.cross(u, n)
+        whole = (np.abs(field) ** 2).sum(axis=1) * (across**2).sum(axis=1)
+        along = np.abs((field * across).sum(axis=1)) ** 2
+        part = np.where(whole > 1e-24, np.minimum(along / np.maximum(whole, 1e-24), 1.0), 0.5)
+        power = scattered_power(surfaces, face, area, into, back, -(u * w).sum(axis=1), part)
+        power = np.where(into * back > 0, np.maximum(power, 0.0), 0.0)
+        scale = self._wavelength / (4 * np.pi)
+        return scale * passed * np.sqrt(power) / (seen.tx_radius * seen.rx_radius)
 
     def _shade(self, part: SeenByMirror, state: LinkState, bodies: Bodies) -> None:
         """Put it into the shadows of the swarm's bodies, on both ways."""
@@ -253,59 +281,3 @@ class TwoBounces:
             bodies.factor(there, self._wavelength, bodies.spared([(state.link.tx,)]))
             * bodies.factor(back, self._wavelength, bodies.spared([(state.link.rx,)]))
         )
-
-
-def lay_out(
-    points: np.ndarray,
-    normal: np.ndarray,
-    start: np.ndarray,
-    end: np.ndarray,
-    before: bool,
-    rows: Rows,
-) -> None:
-    """Fill the geometry of rows (K,) of ways over scatterers (N, 3) between two ends (3, 3), their
-    position, velocity and acceleration; one is the image behind a mirror, and its direction is
-    mirrored back to that at the terminal itself."""
-    there, back = (motion_to(points[rows.cell], body) for body in (start, end))
-    for out, one, other in zip(rows[:3], there, back, strict=False):
-        out[:] = one + other
-    rows.tx_radius[:], rows.rx_radius[:] = there[0], back[0]
-    rows.departure[:], rows.arrival[:] = there[3], back[3]
-    turned = rows.departure if before else rows.arrival
-    turned[:] = mirror_image(turned, normal)
-
-
-def weigh(
-    surfaces: Surfaces,
-    face: np.ndarray,
-    area: np.ndarray,
-    share: np.ndarray,
-    scale: float,
-    normal: np.ndarray,
-    slab: tuple[np.ndarray, np.ndarray],
-    before: bool,
-    rows: Rows,
-    gain: np.ndarray,
-) -> None:
-    """Fill the complex gains (K,) of ways over scatterers; their own amplitudes are left out.
-
-    The mirror passes the part of the vertical field that the receiving end takes as vertical; the
-    field that arrives at a scatterer says which share of its power is TE there.
-    """
-    i, away, home = rows.cell, rows.departure, -rows.arrival
-    n = surfaces.normals[face[i]]
-    u, w = (mirror_image(away, normal), home) if before else (away, mirror_image(home, normal))
-    if before:
-        field = mirrored_field(vertical(away), away, u, normal, *slab)
-        passed = (field * vertical(u)).sum(axis=1)
-    else:
-        field, mirrored = vertical(u), mirrored_field(vertical(w), w, home, normal, *slab)
-        passed = (mirrored * vertical(home)).sum(axis=1)
-    into, back = (u * n).sum(axis=1), -(w * n).sum(axis=1)
-    across = np.cross(u, n)
-    whole = (np.abs(field) ** 2).sum(axis=1) * (across**2).sum(axis=1)
-    along = np.abs((field * across).sum(axis=1)) ** 2
-    part = np.where(whole > 1e-24, np.minimum(along / np.maximum(whole, 1e-24), 1.0), 0.5)
-    power = scattered_power(surfaces, face[i], area[i], into, back, -(u * w).sum(axis=1), part)
-    power = np.where(into * back > 0, np.maximum(power, 0.0), 0.0)
-    gain[:] = scale * share * passed * np.sqrt(power) / (rows.tx_radius * rows.rx_radius)
