@@ -43,23 +43,6 @@ def test_scatterers_in_flight(own):
     assert_twins_agree(name, surfaces, points, *each, 0.37, start, end, own, rows, rtol=2e-7)
 
 
-@pytest.mark.sionna
-def test_points_that_a_mirror_shows():
-    """Two triangles of a wall on a slant, points on both sides. Planted bug: the share of the way
-    counted from the other end."""
-    import isac_rt.propagation.clutter.mirrors  # noqa: F401  # has the twin
-
-    rng = np.random.default_rng(8)
-    normal = np.array([0.8, 0.36, 0.48])
-    across = np.linalg.svd(normal[None])[2][1:]
-    square = np.array([[-9.3, -4.1], [8.2, -4.4], [8.7, 5.9], [-9.1, 5.2]]) @ across + 3.1 * normal
-    corners = square[np.array([[0, 1, 2], [0, 2, 3]])]
-    points = rng.uniform(-30, 30, (2000, 3))
-    place = np.array([14.3, 9.7, 6.1])
-    name = "isac_rt.propagation.clutter.mirrors.on_the_wall"
-    assert_twins_agree(name, points, place, normal, 3.1, corners, rtol=1e-12)  # rounding
-
-
 def test_planes_of_faces():
     """Boxes that share some planes and not others. Planted bug: a plane taken for all that touch
     it with one corner."""

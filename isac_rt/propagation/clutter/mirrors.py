@@ -20,9 +20,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isac_rt.kernels import propagation_mirrors
-from isac_rt.kernels.jit import twin_of
-from isac_rt.kernels.propagation_mirrors import APART
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.clutter.sight import Flight
 from isac_rt.propagation.legs.geometry import LIFT, plane_of_each_face
@@ -35,6 +32,9 @@ from isac_rt.world.swarm import Pose
 
 PLACES = 16
 """Places along a flight from which mirrors are weighed."""
+APART = 0.01
+"""A point this near to the plane of a mirror [m] does not show in it: it lies on the wall, or in
+its corner."""
 COARSE = Density(0.3, 2.0)
 """Cells by which solid angles are taken [m, m^2]: some 500 of them over a plane that fills half of
 the view."""
@@ -153,7 +153,6 @@ def shown(
     return [f[0][part] for f, part in zip(found, np.split(free, ends[:-1]), strict=True)]
 
 
-@twin_of(propagation_mirrors.on_the_wall)
 def on_the_wall(
     points: np.ndarray, place: np.ndarray, normal: np.ndarray, offset: float, corners: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +168,9 @@ def on_the_wall(
     met = plane_crossing(image, points[which], normal, offset)
     areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = areas / np.linalg.norm(areas, axis=1, keepdims=True)
-    inside = over_triangle(met[:, None], corners, normals, 1e-9).any(axis=1)
-    low, high = corners.min(axis=(0, 1)) - 1e-6, corners.max(axis=(0, 1)) + 1e-6
-    inside &= ((met >= low) & (met <= high)).all(axis=1)
+    inside = np.zeros(len(met), bool)
+    for triangle, own in zip(corners, normals, strict=True):
+        low, high = triangle.min(axis=0) - 1e-6, triangle.max(axis=0) + 1e-6
+        near = np.flatnonzero(((met >= low) & (met <= high)).all(axis=1))
+        inside[near] |= over_triangle(met[near], triangle, own, 1e-9)
     return which[inside], met[inside]
