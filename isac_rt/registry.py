@@ -159,5 +159,14 @@ CITY_SOURCES = Registry(
     },
 )
 """Functions of the settings `City` and the scenario's folder that return a `CityParts`."""
+MAP_READERS = Registry(
+    "map_readers",
+    {
+        "files": "isac_rt.extensions.city_files.tables:table_files",
+        "buildings": "isac_rt.extensions.city_files.footprints:footprints",
+        "place": "isac_rt.extensions.city_files.footprints:located",
+    },
+)
+"""Readers of maps: the files that one consists of, its buildings, and where it lies."""
 COMMANDS = Registry("commands", {})
 """Functions with typer's annotations, whose docstring is the help."""

@@ -277,7 +277,8 @@ def warn_of_interference(
     w, (amplitude, noise) = timetable.waveform, budget
     if w.carries_data:
         return
-    most = {}  # of each path: power over the noise, power [W], distance [m], frame
+    # of each path: power over the noise, power [W], distance [m], frame
+    most: dict[tuple[str, str], tuple[float, ...]] = {}
     for frame in np.unique(np.linspace(0, timetable.frames - 1, ALIAS_EPOCHS).round().astype(int)):
         poses = swarm.poses(timetable.epoch(int(frame)))
         for tx, rx in itertools.permutations(timetable.with_role("active", int(frame)), 2):

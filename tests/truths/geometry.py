@@ -10,12 +10,12 @@ import numpy as np
 from scipy.integrate import quad
 
 from isac_rt import scenario as tree
+from isac_rt.extensions.city_files.extrude import building
 from isac_rt.frame.link import Link
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.legs.geometry import Legs, plane_of_each_face, straight, unfold
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.world.city import load_city
-from isac_rt.world.city.extrude import building
 from isac_rt.world.city.materials import MaterialUse
 from isac_rt.world.city.mesh import clean
 from isac_rt.world.city.place import LONLAT, Place, plane_about

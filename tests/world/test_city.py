@@ -13,8 +13,8 @@ import pytest
 import trimesh
 
 from isac_rt import scenario
+from isac_rt.extensions.city_files.extrude import building
 from isac_rt.world.city import CityError, CityMesh, load_city, parametric
-from isac_rt.world.city.extrude import building
 from isac_rt.world.city.materials import (
     KNOWN_MATERIALS,
     MaterialUse,

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from isac_rt.registry import CITY_SOURCES
+from isac_rt.registry import CITY_SOURCES, MAP_READERS
 from isac_rt.world import settings
-from isac_rt.world.city.files import needs_extra
+from isac_rt.world.city.files import missing_extra, needs_extra
 from isac_rt.world.city.materials import CityError, resolve_materials
 from isac_rt.world.city.mesh import CityMesh, Surface, check_size, clean, empty_city
 from isac_rt.world.city.meshfiles import mesh_file, mesh_files, mesh_place
@@ -66,8 +66,8 @@ def city_files(city: settings.City | None, folder: Path) -> list[Path]:
         return [_path(city, folder)] if city.file else []
     path = _path(city, folder)
     if city.source == "footprints":
-        tables, terrain = _map_reader("tables", path), _terrain(city, folder)
-        return [*tables.table_files(path), *([] if terrain is None else [terrain])]
+        terrain = _terrain(city, folder)
+        return [*_map_reader("files", path)(path), *([] if terrain is None else [terrain])]
     return mesh_files(path) if city.source == "mesh" else mitsuba_files(path)
 
 
@@ -91,15 +91,18 @@ class CityParts:
     may_lie: bool = False
 
 
-def _map_reader(module: str, path: Path) -> Any:
-    """Import a module of this folder that needs shapely, pyproj and mapbox_earcut.
+def _map_reader(part: str, path: Path) -> Any:
+    """Return a reader of maps, which needs shapely, pyproj and mapbox_earcut.
 
     Raises
     ------
     CityError  If they are not installed.
     """
     needs_extra("pyproj", path.name, "maps")
-    return needs_extra(f"isac_rt.world.city.{module}", path.name, "maps")
+    try:
+        return MAP_READERS.load(part)
+    except ImportError:
+        raise missing_extra(path.name, "maps") from None
 
 
 def canyon(city: settings.City, folder: Path) -> CityParts:
@@ -119,7 +122,7 @@ def blocks(city: settings.City, folder: Path) -> CityParts:
 def footprints(city: settings.City, folder: Path) -> CityParts:
     """Buildings extruded from footprints or read as solids, on their terrain."""
     path = _path(city, folder)
-    found = _map_reader("footprints", path).footprints(city, path, _terrain(city, folder))
+    found = _map_reader("buildings", path)(city, path, _terrain(city, folder))
     return CityParts(city.name or path.name, *found)
 
 
@@ -150,7 +153,7 @@ def city_place(city: settings.City, folder: Path) -> Place | None:
     if city.source != "footprints":
         return None
     path = _path(city, folder)
-    place: Place = _map_reader("footprints", path).located(city, path, [], [])[1]
+    place: Place = _map_reader("place", path)(city, path, [], [])[1]
     return place
 
 

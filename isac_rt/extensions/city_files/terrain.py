@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isac_rt.world.city.cityjson import BUILDING_TYPES, Body
+from isac_rt.extensions.city_files.cityjson import BUILDING_TYPES, Body
 from isac_rt.world.city.files import needs_extra, read_bytes
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface

@@ -12,19 +12,27 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from isac_rt.extensions.city_files.buildings import Outline, buildings, moved
+from isac_rt.extensions.city_files.cityjson import CityModel, is_sequence, read_cityjson
+from isac_rt.extensions.city_files.extrude import building, polygons_of, roofed
+from isac_rt.extensions.city_files.geojson import by_lines, read_geojson, tell_bad
+from isac_rt.extensions.city_files.tables import TABLES, read_table
+from isac_rt.extensions.city_files.terrain import (
+    Ground,
+    Plan,
+    feet_of,
+    flat,
+    lowered,
+    of_raster,
+    of_relief,
+)
+from isac_rt.extensions.city_files.terrain import through_feet as ground_through
 from isac_rt.world import settings
-from isac_rt.world.city.buildings import Outline, buildings, moved
-from isac_rt.world.city.cityjson import CityModel, is_sequence, read_cityjson
-from isac_rt.world.city.extrude import building, polygons_of, roofed
 from isac_rt.world.city.files import JSON_FACTOR, read_bytes, unpacked
-from isac_rt.world.city.geojson import by_lines, read_geojson, tell_bad
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface, check_coordinates
 from isac_rt.world.city.place import Place, crs_name, place_of
 from isac_rt.world.city.prism import Finish
-from isac_rt.world.city.tables import TABLES, read_table
-from isac_rt.world.city.terrain import Ground, Plan, feet_of, flat, lowered, of_raster, of_relief
-from isac_rt.world.city.terrain import through_feet as ground_through
 
 STRAY = 20.0
 """Farther from the middle than so many times nine of ten, and `STRAY_M`, is a stray footprint."""

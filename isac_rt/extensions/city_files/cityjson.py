@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic_core import from_json, to_json
 
+from isac_rt.extensions.city_files.buildings import Outline
+from isac_rt.extensions.city_files.extrude import check_corners, triangulate
 from isac_rt.world import settings
-from isac_rt.world.city.buildings import Outline
-from isac_rt.world.city.extrude import check_corners, triangulate
 from isac_rt.world.city.files import Items, Part, parsed
 from isac_rt.world.city.heights import parse_length, roof_over_ground
 from isac_rt.world.city.materials import CityError, MaterialUse

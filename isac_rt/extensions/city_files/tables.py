@@ -19,7 +19,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from isac_rt.world.city.buildings import Feature
+from isac_rt.extensions.city_files.buildings import Feature
 from isac_rt.world.city.files import missing_extra, read_bytes
 from isac_rt.world.city.materials import CityError
 

@@ -1,4 +1,4 @@
-"""The process that GDAL and Arrow read a table in: `isac_rt.world.city.tables` starts it.
+"""The process that GDAL and Arrow read a table in: `tables` starts it.
 
 It is run as a file of its own, with the packages of the process that starts it, and imports nothing
 of this one. The table comes over standard input, so that the process needs no file; every driver

@@ -9,7 +9,7 @@ import shapely
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic_core import from_json
 
-from isac_rt.world.city.buildings import Feature
+from isac_rt.extensions.city_files.buildings import Feature
 from isac_rt.world.city.files import Items, Part, first_error
 from isac_rt.world.city.materials import CityError
 

@@ -1,0 +1,1 @@
+"""Cities from maps: footprints, CityJSON, tables of GDAL and terrain."""
