@@ -358,7 +358,7 @@ _PRINT = {
 STYLES = {
     "screen": Style(8.4, 2, 1.0, {}),
     "wide": Style(7.16, 2, 0.8, _PRINT | {"font.size": 8, "legend.fontsize": 7}),
-    "column": Style(3.5, 1, 0.7, _PRINT | {"font.size": 7, "legend.fontsize": 5.5}),
+    "column": Style(3.5, 1, 0.7, _PRINT | {"font.size": 7, "legend.fontsize": 6}),
 }
 """For a screen, for both columns of a page of a journal, and for one."""
 FORMS = ("png", "svg", "pdf")

@@ -106,7 +106,7 @@ def city_traces(city: CityMesh, low: np.ndarray, high: np.ndarray) -> list[Trace
         "colorscale": [[0, "#E4E2DC"], [1, "#8E9AA6"]],
         "showscale": False,
         "flatshading": True,
-        "opacity": 0.5,  # paths and flights stay visible behind walls
+        "opacity": 0.3,  # paths and flights stay visible behind walls
         "lighting": {"ambient": 0.6, "diffuse": 0.7, "specular": 0.05},
     }
     return [
