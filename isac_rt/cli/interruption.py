@@ -88,7 +88,7 @@ def say_interrupted() -> None:
 
 def _say_kept(file: Path) -> None:
     if file.exists():
-        _say(f"{file} keeps the frames so far; the same command goes on after them")
+        _say(f"{file} keeps the frames so far; the same command resumes after them")
 
 
 def _say(text: str) -> None:

@@ -20,7 +20,7 @@ SYMBOLS = ("delay", "dpsk", "bit")
 PARTS = ("localisation", "missed", "false")
 """Of the GOSPA distance."""
 ERRORS = ("position", "velocity", "squared")
-"""Measures of a body's error."""
+"""Measures of a fused track's error."""
 SIZES = {
     "kind": len(KINDS),
     "symbol": len(SYMBOLS),
@@ -121,7 +121,7 @@ OBSERVERS: dict[str, Column] = {
         for name, (units, _) in MEASURES.items()
     },
     "in_view": _number("UAV inside the field of view", "in_view", bool, dims=("uav",)),
-    "shadowed": _number("UAV hidden by the city", "shadowed", bool, dims=("uav",)),
+    "shadowed": _number("UAV occluded by the city", "shadowed", bool, dims=("uav",)),
     "hit": _number(
         "UAV found by its own path within one resolution on all four axes",
         "hit",
@@ -348,36 +348,38 @@ PICTURES: dict[str, Column] = {
         np.nan,
     ),
     "seen": _number("target in view of a terminal", "seen", bool, dims=("uav",)),
-    "found": _number("target in view that the picture has", "found", bool, dims=("uav",)),
+    "found": _number(
+        "target in view with a fused track that its echo updates", "found", bool, dims=("uav",)
+    ),
     "error": _number(
-        "of targets found: position [m], velocity [m s-1], squared error of position in the "
-        "deviations stated over its axes",
+        "errors of targets found: position [m], velocity [m s-1], normalised squared position "
+        "error over its axes",
         "error",
         float,
         dims=("uav", "measure"),
         missing=np.nan,
     ),
-    "false": _number("bodies that stand for nobody", "false", np.int32),
-    "hidden": _number("bodies that stand for a target in nobody's view", "hidden", np.int32),
+    "false": _number("fused tracks of no UAV", "false", np.int32),
+    "hidden": _number("fused tracks of a target outside every view", "hidden", np.int32),
     "unrecognised": _number(
-        "bodies that stand for a terminal without being recognised", "unrecognised", np.int32
+        "fused tracks of a terminal that is not recognised", "unrecognised", np.int32
     ),
-    "reports": _number("tracks or detections heard from others that count", "reports", np.int32),
-    "age": Column(float, "s", "mean age of the tracks heard from others", "age", missing=np.nan),
+    "reports": _number("tracks or detections of others that are used", "reports", np.int32),
+    "age": Column(float, "s", "mean age of the reports of others", "age", missing=np.nan),
     "messages": _number("messages that ended in the frame", "messages", np.int32),
     "lost": _number("those of them that were lost", "lost", np.int32),
     "late": _number(
         "earlier messages, lost until then, that came with a frame read late", "late", np.int32
     ),
     "bits": _number("bits of these messages", "bits", np.int64),
-    "room": _number("bits that the ways to the terminal had for messages", "room", np.int64),
+    "room": _number("capacity of the links to the terminal for messages in bits", "room", np.int64),
     "left_out": _number(
         "tracks or detections that the messages had no room for", "left_out", np.int32
     ),
 }
-"""One value for each frame and picture."""
+"""One value for each frame and set of fused tracks."""
 FUSED: dict[str, Column] = {
-    "origin": _number("link whose track names the body, along observer", "origin", np.int16),
+    "origin": _number("link whose track names the fused track, along observer", "origin", np.int16),
     "number": _number("number of that track", "number", np.int32),
     **{
         f"{word}{axis}{suffix}": Column(
@@ -392,7 +394,7 @@ FUSED: dict[str, Column] = {
         )
         for i, axis in enumerate("xyz")
     },
-    "members": _number("tracks that are taken for the body", "members", np.int16),
+    "members": _number("tracks that are fused", "members", np.int16),
     "terminal": _number(
         "index of the UAV of the swarm that it is recognised as, -1: none", "terminal", np.int16
     ),

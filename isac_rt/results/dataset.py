@@ -276,7 +276,7 @@ def _put_pictures(put: Callable[..., None], tables: Tables, sizes: Mapping[str, 
     if not names:
         return
     for name, words, meaning in (
-        ("picture", names, "terminal, or all of them together"),
+        ("picture", names, "terminal whose fused tracks they are, or the whole swarm"),
         ("part", PARTS, "part of the GOSPA distance"),
         ("measure", ERRORS, "measure of an error"),
     ):

@@ -134,7 +134,7 @@ def write_animation(
     city: CityMesh | None = None,
     rate: float = 5.0,
 ) -> None:
-    """Write the moving picture as GIF or, where there is ffmpeg, MP4; it appears whole or not at
+    """Write the animation as GIF or, where there is ffmpeg, MP4; it appears whole or not at
     all.
 
     Parameters
@@ -149,7 +149,7 @@ def write_animation(
     file = Path(file)
     writer = WRITERS.get(file.suffix)
     if writer is None:
-        raise ResultsError(f"{file}: a moving picture ends in {' or '.join(WRITERS)}; name it so")
+        raise ResultsError(f"{file}: an animation ends in {' or '.join(WRITERS)}; name it so")
     if not writers.is_available(writer):
         raise ResultsError(
             f"{file}: {file.suffix} needs {writer}, which is not on this machine; install it or "

@@ -179,7 +179,7 @@ def test_the_report_and_the_moving_picture_show_the_pictures(talked):
         (found,) = fused_positions(d, 8, name)
         assert np.linalg.norm(found - d.uav_position.values[8, 2]) < 1.0
         bodies = {trace["name"]: trace for trace in scene["frames"][8]["data"]}
-        shown = bodies["picture of the swarm" if name == SWARM else f"picture of {name}"]
+        shown = bodies["fused tracks of the swarm" if name == SWARM else f"fused tracks of {name}"]
         assert [shown[a] for a in "xyz"] == np.round(found, 2)[:, None].tolist()
     alone = d.drop_vars([name for name in d.variables if name == "picture"])
     assert fused_positions(alone, 8, SWARM).shape == (0, 3)
@@ -187,8 +187,8 @@ def test_the_report_and_the_moving_picture_show_the_pictures(talked):
     moving._func(1)
     marks = {line.get_label(): line.get_xdata() for line in figure.axes[0].lines}
     here = d.uav_position.values[int(d.snapshot_frame.values[1]), 2, 0]
-    assert marks["picture of the whole swarm"] == pytest.approx([here], abs=1.0)
-    assert marks["its picture with what it hears"] == pytest.approx([here], abs=1.0)
+    assert marks["fused tracks of the whole swarm"] == pytest.approx([here], abs=1.0)
+    assert marks["its fused tracks"] == pytest.approx([here], abs=1.0)
 
 
 def test_a_reference_is_not_told_as_a_detection():
