@@ -49,7 +49,7 @@ class Plots:
     def range_doppler(
         self, observer: str | None = None, snapshot: int = -1, ax: Axes | None = None
     ) -> Axes:
-        """Map of a terminal (by default the first) in one of the kept frames (the last)."""
+        """Map of a link (by default the first) in one of the snapshots (the last)."""
         kept = self._snapshot(snapshot)
         return maps.range_doppler(_axes(ax), self.results.dataset, kept, self._number(observer))
 
@@ -61,10 +61,12 @@ class Plots:
         number = self._number(observer)
         return figures.over_time(_axes(ax), self.results.dataset, number, measure)
 
-    def errors(self, measure: Measure = "range", ax: Axes | None = None) -> Axes:
-        """Distribution of the absolute errors at every terminal."""
+    def errors(
+        self, measure: Measure = "range", ax: Axes | None = None, terminals: bool = False
+    ) -> Axes:
+        """Distribution of the absolute errors of targets, or of terminals, on every link."""
         _check(measure, Measure)
-        return figures.error_cdf(_axes(ax), self.results.dataset, measure)
+        return figures.error_cdf(_axes(ax), self.results.dataset, measure, terminals)
 
     def paths(
         self,
@@ -72,7 +74,7 @@ class Plots:
         against: Against = "delay",
         ax: Axes | None = None,
     ) -> Axes:
-        """Power of every path of the kept frames."""
+        """Power of every path of the snapshots."""
         _check(against, Against)
         self._snapshot(-1)
         number = self._number(observer)

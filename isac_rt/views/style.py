@@ -48,6 +48,7 @@ STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.titlesize": 10,
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,  # where they are anyway; else all tick labels are measured once more
     "text.hinting": "none",  # a twelfth of the time of a figure, and letters stand more evenly
     "legend.frameon": False,
     "legend.fontsize": 8,
