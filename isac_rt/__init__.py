@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from isac_rt.simulation.setup import prepare as prepare
     from isac_rt.simulation.setup import trace as trace
     from isac_rt.simulation.simulate import run as run
-    from isac_rt.simulation.simulate import standard_terminal as standard_terminal
+    from isac_rt.simulation.stations import standard_terminal as standard_terminal
     from isac_rt.sweep import Samples as Samples
     from isac_rt.sweep import load_dataset as load_dataset
     from isac_rt.sweep import load_sweep as load_sweep
@@ -92,7 +92,8 @@ _NAMES = {
     "signal.if_signal": "add_noise if_signal",
     "signal.methods": "Auto Direct Exact Gridded Separable",
     "simulation.setup": "Frame Setup city_of prepare trace",
-    "simulation.simulate": "run standard_terminal",
+    "simulation.simulate": "run",
+    "simulation.stations": "standard_terminal",
     "sweep": "Samples load_dataset load_sweep open_sweep run_dataset run_sweep",
     "track.terminal": "ActiveTerminal PassiveTerminal",
     "views.animate": "animate write_animation",

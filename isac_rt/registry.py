@@ -130,7 +130,7 @@ COOPERATIONS = Registry(
     "cooperations",
     {name: "isac_rt.extensions.cooperation.swarm:Cooperation" for name in ("tracks", "detections")},
 )
-"""Functions of a `Setup` that return an `isac_rt.simulation.simulate.Exchange`."""
+"""Functions of a `Setup` that return an `isac_rt.simulation.stations.Exchange`."""
 ACCESS = Registry(
     "access",
     {

@@ -12,7 +12,7 @@ from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.scenario.file import load
 from isac_rt.simulation.setup import prepare
-from isac_rt.simulation.simulate import _Observer, standard_terminal
+from isac_rt.simulation.stations import Station, standard_terminal
 
 SCENE = Path(__file__).parents[2] / "scenes" / "munich_swarm.yaml"
 C, BOLTZMANN = 299_792_458.0, 1.380649e-23
@@ -81,8 +81,8 @@ def test_the_matched_filter_of_losses_is_one():
     flights = setup.swarm.trajectories
     for link in (Link("AT", "AT"), Link("AT", "PT2")):
         terminal = standard_terminal(setup, link, scenario)
-        observer = _Observer(setup, link, terminal, scenario.receivers)
-        record = observer.record(frame, observer.hear(frame, frame.heard(link), False))
+        observer = Station(setup, link, terminal, scenario.receivers)
+        record = observer.record(frame, observer.receive(frame, frame.heard(link), False))
         paths = frame.paths[link]
         for i in np.flatnonzero(np.isfinite(record.target_snr)):
             name = list(setup.swarm.uavs)[i]

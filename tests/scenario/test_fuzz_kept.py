@@ -30,7 +30,7 @@ from isac_rt.propagation.store import PathStore
 from isac_rt.results.files import ResultsError, open_results, save, write_dataset
 from isac_rt.runtime import UserError
 from isac_rt.scenario.file import load
-from isac_rt.simulation import simulate
+from isac_rt.simulation import simulate, stations
 from isac_rt.simulation.resume import FILE, Resume, ResumeError
 from isac_rt.simulation.setup import prepare
 from isac_rt.storage import checksum, load_data, pack, save_data
@@ -255,7 +255,7 @@ def test_kept_frames_of_other_trees(whole, data):
         database.execute(
             "UPDATE entry SET tree = ?, checksum = ? WHERE id = ?", (text, seal, at + 1)
         )
-    run = simulate._Run.begin(whole.scenario, whole.setup, 1, simulate.standard_terminal)
+    run = simulate._Run.begin(whole.scenario, whole.setup, 1, stations.standard_terminal)
     dataset_or_message(lambda: run.restore(resume), ResumeError)
 
 
@@ -397,7 +397,7 @@ def test_the_trees_are_what_the_files_hold(whole):
     whole.spoilt("curve", whole.bytes["curve"])
     assert whole.outcomes.read(whole.keys[0])["status"] == "done"
     assert len([*Resume(whole.folder / "run", "content").entries()]) > 1
-    run = simulate._Run.begin(whole.scenario, whole.setup, 1, simulate.standard_terminal)
+    run = simulate._Run.begin(whole.scenario, whole.setup, 1, stations.standard_terminal)
     assert run.restore(Resume(whole.folder / "run", "content")) >= 2
     assert str(PathStore(whole.folder / "paths").get("ab12")) == str(whole.paths)
     assert load_data(whole.folder / "curve", "k") == CURVE

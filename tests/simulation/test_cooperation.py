@@ -20,7 +20,7 @@ from isac_rt.results.swarm import SWARM
 from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.simulation import simulate
 from isac_rt.simulation.resume import Resume
-from isac_rt.simulation.simulate import standard_terminal
+from isac_rt.simulation.stations import standard_terminal
 from isac_rt.track.filter import Gaussian, measure
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import Track, track_set

@@ -14,7 +14,7 @@ from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.scenario.file import load
 from isac_rt.simulation.setup import prepare
-from isac_rt.simulation.simulate import _Observer, standard_terminal
+from isac_rt.simulation.stations import Station, standard_terminal
 
 SCENES = Path(__file__).parents[2] / "scenes"
 ROWS, BINS = 3, 1
@@ -51,10 +51,10 @@ class Counter:
         monkeypatch.setattr(bistatic.BeamSearch, "_judge", noting)
         monkeypatch.setattr(angle_doppler.AngleDoppler, "_judge", noting_own)
 
-    def look(self, observer: _Observer, frame) -> None:
+    def look(self, observer: Station, frame) -> None:
         """Count a frame."""
         self.seen = None
-        heard = observer.hear(frame, frame.heard(observer.link), False)
+        heard = observer.receive(frame, frame.heard(observer.link), False)
         tracks = observer.record(frame, heard).tracks
         self.false += int((tracks.confirmed & (tracks.uav < 0)).sum())
         if self.seen is None or not self.seen[3]:
@@ -95,7 +95,7 @@ def counted(counter: Counter, scene: str, link: Link, changes: list[str]) -> tup
         alone = {name: whole.swarm[name] for name in dict.fromkeys(link)}
         setup = prepare(whole.model_copy(update={"swarm": alone}))
         receivers = setup.scenario.receivers
-        observer = _Observer(setup, link, standard_terminal(setup, link), receivers)
+        observer = Station(setup, link, standard_terminal(setup, link), receivers)
         for number in [n for n in range(16) if link in setup.timetable.links(n)][:8]:
             counter.look(observer, setup.frame(number))
     print(scene, counter.counts.tolist())

@@ -19,7 +19,7 @@ from isac_rt.receive.types import Reception, no_detections
 from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
-from isac_rt.simulation import simulate
+from isac_rt.simulation import simulate, stations
 from isac_rt.simulation.setup import Setup, prepare
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
 
@@ -72,7 +72,7 @@ class Kept:
 
     def terminal(self, setup: Setup, link: Link):
         """The scenario's receiver of a link, which keeps what it is given and hears nothing."""
-        made = simulate.standard_terminal(setup, link)
+        made = stations.standard_terminal(setup, link)
 
         def step(cube, *given, **options):
             own, time = (given[1], given[2]) if link.own else (given[0], given[1])
@@ -120,11 +120,11 @@ def test_every_terminal_is_given_its_own_frame():
             else:
                 assert what is (number >= 2)
             assert options["maps"] is (number in setup.timetable.snapshots(2))
-    standard = simulate.standard_terminal(setup, Link("A", "Q"))
+    standard = stations.standard_terminal(setup, Link("A", "Q"))
     assert isinstance(standard, PassiveTerminal) and standard._receiver.groups == (0, 2)
-    standard = simulate.standard_terminal(setup, Link("A", "P"))
+    standard = stations.standard_terminal(setup, Link("A", "P"))
     assert isinstance(standard, PassiveTerminal) and standard._receiver.groups is None
-    assert isinstance(simulate.standard_terminal(setup, Link("B", "B")), ActiveTerminal)
+    assert isinstance(stations.standard_terminal(setup, Link("B", "B")), ActiveTerminal)
 
 
 def test_feedback_goes_to_the_links_own_active_terminal(monkeypatch):

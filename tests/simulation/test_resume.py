@@ -28,7 +28,7 @@ from isac_rt.results.recorder import Recorder
 from isac_rt.scenario.file import load, to_yaml
 from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.simulation import resume as simulate_resume
-from isac_rt.simulation import simulate
+from isac_rt.simulation import simulate, stations
 from isac_rt.simulation.resume import EARLIER, FILE, Resume, ResumeError
 from isac_rt.simulation.setup import prepare
 from isac_rt.storage import ARRAY, checksum, pack, unpack
@@ -178,15 +178,14 @@ def test_everything_that_is_carried_over_is_taken_up(tmp_path):
     setup = prepare(scenario)
 
     def begin():
-        return simulate._Run.begin(scenario, setup, 1, simulate.standard_terminal)
+        return simulate._Run.begin(scenario, setup, 1, stations.standard_terminal)
 
     resume = Resume(tmp_path, "content", every=1e9)
     first, second = begin(), begin()
     with pytest.raises(Stopped):
         first.fly(stopping_at(4), 1, resume)
-    listeners = [first.own, *first.compared.values()]
-    for one in listeners:
-        for observer in one.observers.values():
+    for one in first.sets.values():
+        for observer in one.stations.values():
             for part in (observer, observer.terminal):
                 counted(part)
             counted(observer.terminal.tracker.state)
@@ -205,10 +204,10 @@ def test_a_run_with_all_but_its_last_frame_kept_hears_that_one_alone(tmp_path, m
     resume = Resume(tmp_path, run_content(scenario, 1), every=0.0)
     whole = simulate.run(scenario, snapshots=1, resume=resume)
     heard = []
-    hear = simulate._Observer.hear
+    hear = stations.Station.receive
     monkeypatch.setattr(
-        simulate._Observer,
-        "hear",
+        stations.Station,
+        "receive",
         lambda self, frame, *rest: heard.append(frame.number) or hear(self, frame, *rest),
     )
     again = simulate.run(scenario, snapshots=1, resume=resume)
@@ -328,8 +327,8 @@ def test_a_file_from_elsewhere_is_refused_with_one_message(tmp_path, spoil):
     [
         3,
         {},
-        {"first": 0, "rows": [{"frame": 0}], "observers": {}, "advice": [], "seconds": {}},
-        {"first": 0, "rows": [], "observers": {}, "advice": [], "seconds": {}},
+        {"first": 0, "sets": {"own": {"rows": [{"frame": 0}]}}, "advice": [], "seconds": {}},
+        {"first": 0, "sets": {"own": {"rows": []}}, "advice": [], "seconds": {}},
     ],
 )
 def test_an_entry_that_is_no_runs_is_refused_before_a_frame(tmp_path, entry):
@@ -408,7 +407,7 @@ def test_frames_that_could_not_be_kept_are_kept_with_the_next(tmp_path, monkeypa
     append, tries = resume.append, iter([False, True, False, True])
     monkeypatch.setattr(resume, "append", lambda entry: next(tries) and append(entry))
     simulate.run(scenario, snapshots=1, resume=resume)
-    assert [len(entry["rows"]) for entry in resume.entries()] == [2, 2]
+    assert [len(entry["sets"]["own"]["rows"]) for entry in resume.entries()] == [2, 2]
     again = Resume(tmp_path, run_content(scenario, 1), every=1e3)
     assert_equal_results(simulate.run(scenario, snapshots=1, resume=again), whole)
 
@@ -428,10 +427,14 @@ def test_frames_that_two_calls_kept_are_taken_up_once(tmp_path):
     two.append = lambda entry: next(tries) and append(entry)
     simulate.run(scenario, snapshots=1, resume=two)
     (a, b, *_), (c, *_) = (list(r.entries()) for r in (one, two))
-    assert [(len(e["rows"]), e["first"]) for e in (a, b, c)] == [(1, 0), (1, 1), (2, 0)]
+    assert [(len(e["sets"]["own"]["rows"]), e["first"]) for e in (a, b, c)] == [
+        (1, 0),
+        (1, 1),
+        (2, 0),
+    ]
     for entry in (a, c, b, b, c):
         both.append(entry)
-    run = simulate._Run.begin(scenario, prepare(scenario), 1, simulate.standard_terminal)
+    run = simulate._Run.begin(scenario, prepare(scenario), 1, stations.standard_terminal)
     assert run.restore(both) == 2
     assert run.recorder.dataset().frame.values.tolist() == [0, 1]
     assert_equal_results(simulate.run(scenario, snapshots=1, resume=both), whole)
@@ -533,7 +536,7 @@ def test_whatever_ends_a_run_keeps_what_is_done(
     (tmp_path / "scene.yaml").write_text(to_yaml(dense_scenario(frames=4)))
     monkeypatch.setattr(Resume.__init__, "__defaults__", (0.0,))
     monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
-    hear = simulate._Observer.hear
+    hear = stations.Station.receive
 
     def broken(self, frame, *rest):
         if frame.number == 3:
@@ -542,7 +545,7 @@ def test_whatever_ends_a_run_keeps_what_is_done(
 
     command = ["run", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "out")]
     with monkeypatch.context() as once:
-        once.setattr(simulate._Observer, "hear", broken)
+        once.setattr(stations.Station, "receive", broken)
         assert main(command) == status
     shown = capsys.readouterr().err
     assert said in shown and "keeps the frames so far" in shown and "Traceback" not in shown

@@ -19,7 +19,7 @@ from isac_rt.results.records import LateRecord
 from isac_rt.results.scoring import Heard
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
-from isac_rt.simulation.simulate import PREFETCHED_FRAMES
+from isac_rt.simulation.stations import PREFETCHED_FRAMES
 from isac_rt.track.filter import Ambiguity
 from isac_rt.track.fused import Fused
 from isac_rt.track.parts import KnownBody, of_itself

@@ -1,0 +1,300 @@
+"""Terminals of a run: each link's receiver with its score, and the sets that they form."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.link import Link
+from isac_rt.receive.settings import Receivers
+from isac_rt.registry import ACCESS, COOPERATIONS, EQUIPMENT
+from isac_rt.results.metrics import SymbolCount
+from isac_rt.results.recorder import Recorder
+from isac_rt.results.records import FrameRecord, LateRecord, ObserverRecord, PictureRecord
+from isac_rt.results.scoring import Heard, Scorer
+from isac_rt.results.swarm import SwarmScorer, View
+from isac_rt.scenario.presets import ReceiverSet
+from isac_rt.scenario.tree import Scenario
+from isac_rt.simulation.setup import Frame, Setup
+from isac_rt.track.parts import Equipment, KnownBody, Late
+from isac_rt.track.reference import TerminalState
+from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal, Receiver
+from isac_rt.world.swarm import Pose, Swarm
+
+PREFETCHED_FRAMES = 2
+"""Frames at work at once: a frame does not wait for the slowest link of the one before, and its
+receivers know what was reported to them until this many frames before it."""
+Terminal = ActiveTerminal | PassiveTerminal
+
+
+def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = None) -> Terminal:
+    """The receiver of a link as the scenario has it, or as a set of receivers to compare with.
+
+    Examples
+    --------
+    >>> import isac_rt as irt
+    >>> setup = irt.prepare(irt.load("scenes/paper_swarm_consistent.yaml"))
+    >>> [type(standard_terminal(setup, link)).__name__ for link in setup.timetable.links(0)]
+    ['ActiveTerminal', 'PassiveTerminal', 'PassiveTerminal']
+    """
+    s = settings or setup.scenario
+    equipment = EQUIPMENT.load("city")(setup, link, s) if _knows_city(s) else Equipment()
+    known = setup.waveform, setup.antennas, s.receivers, s.tracking
+    if link.own:
+        return ActiveTerminal(*known, equipment)
+    order, groups = setup.scenario.modulation.dpsk_order, setup.timetable.groups(link)
+    return PassiveTerminal(*known, order, setup.plan.amplitude, groups, equipment)
+
+
+def _knows_city(s: ReceiverSet | Scenario) -> bool:
+    """Return whether terminals have more than a receiver and a tracker."""
+    r = s.receivers
+    return (
+        s.tracking.births == "unexplained"
+        or r.link_acquisition == "blind"
+        or r.self_calibration != "none"
+        or r.passive_detector == "beams"
+        or r.gate_false_alarm_rate is not None
+    )
+
+
+def terminal_with(setup: Setup, link: Link, made: Terminal | Receiver) -> Terminal:
+    """A terminal as it is, or the scenario's own with `made` as its receiver.
+
+    Raises
+    ------
+    TypeError  If `made` has no `receive`.
+    """
+    if isinstance(made, ActiveTerminal | PassiveTerminal):
+        return made
+    if not isinstance(made, Receiver):
+        raise TypeError(
+            f"the terminal of {link} is {type(made).__name__}, which has no receive; return a "
+            "terminal or an object with receive"
+        )
+    out = standard_terminal(setup, link)
+    out.other = made
+    return out
+
+
+class Station:
+    """Receiving terminal of one link with its score."""
+
+    def __init__(self, setup: Setup, link: Link, terminal: Terminal, receivers: Receivers) -> None:
+        self.link, self.setup, self.terminal = link, setup, terminal
+        self.scorer = Scorer(link, setup.antennas, setup.swarm, setup.timetable, receivers)
+        self.receivers = receivers
+        self.feedback = {"answers": 0, "corrections": 0}
+        self.seconds = 0.0
+        """Processor time of reception and tracking so far."""
+
+    def receive(
+        self,
+        frame: Frame,
+        cube: IFCube,
+        maps: bool,
+        reports: Sequence[KnownBody] = (),
+    ) -> Heard:
+        """Receive one frame and track; `reports` are the targets that the receiver knows of from
+        others. Runs in a thread of its own; only this station's state changes."""
+        begun = time.thread_time()
+        timetable, (tx, rx) = self.setup.timetable, self.link
+        when = timetable.epoch(frame.number, tx)
+        own = self.setup.believed(self.setup.swarm.trajectories[rx].pose(when))
+        mates = self._mates(frame.number, when)
+        state = int(TerminalState.TRACKING)
+        late: tuple[Late, ...] = ()
+        if isinstance(self.terminal, ActiveTerminal):
+            payload, clutter = frame.sent[tx].payload, frame.expected.get(tx)
+            reception, tracks = self.terminal.step(
+                cube, payload, own, when, clutter=clutter, mates=mates, told=reports, maps=maps
+            )
+        else:
+            modulated = timetable.modulated(frame.number)
+            reception, tracks = self.terminal.step(
+                cube,
+                own,
+                when,
+                modulated,
+                mates=mates,
+                sender=self._sender(when),
+                told=reports,
+                maps=maps,
+            )
+            state, late = int(self.terminal.status), self.terminal.late
+        self.seconds += time.thread_time() - begun
+        return Heard(reception, tracks, state, late)
+
+    def _sender(self, when: float) -> Pose | None:
+        """Return where the link's transmitter reports to be; None: it reports nothing."""
+        s = self.setup
+        if s.scenario.cooperation == "none":
+            return None
+        return s.believed(s.swarm.trajectories[self.link.tx].pose(when))
+
+    def _mates(self, frame: int, when: float) -> list[Pose]:
+        """Return the poses that the other end of the link, or at an active terminal those of all
+        links, report, as far as the receiver asks."""
+        s = self.setup
+        if self.receivers.self_calibration != "positions":
+            return []
+        tx, rx = self.link
+        names = s.timetable.with_role("passive", frame) if self.link.own else [tx]
+        return [s.believed(s.swarm.trajectories[name].pose(when)) for name in names if name != rx]
+
+    def feed_back(self, frame: int, heard: Heard, at_active: Heard) -> None:
+        """Exchange the passive terminal's feedback after a frame, and the active one's answer."""
+        if not isinstance(self.terminal, PassiveTerminal):
+            return
+        s, when = self.setup, self.setup.timetable.epoch(frame, self.link.tx)
+        answer = ACCESS.load("feedback")(
+            heard.reception,
+            heard.tracks,
+            at_active.tracks,
+            s.antennas.num_rx,
+            s.connections.offset_std(self.link, when),
+            s.waveform,
+        )
+        if answer is not None:
+            self.feedback["answers"] += 1
+            self.feedback["corrections"] += answer.cells != 0
+            if answer.cells:
+                self.terminal.shorten(answer.cells, s.swarm.trajectories[self.link.rx].pose(when))
+
+    def memory(self, carried: dict[str, Any] | None) -> dict[str, Any]:
+        """Return the state carried over to the next frame as plain numbers and arrays, for
+        `restore`; `carried` is the terminal's part of it where that is at work on a later frame."""
+        return {
+            "terminal": self.terminal.memory() if carried is None else carried,
+            "scorer": self.scorer.memory(),
+            "feedback": self.feedback,
+            "seconds": self.seconds,
+        }
+
+    def restore(self, memory: dict[str, Any]) -> None:
+        """Go on from a `memory`."""
+        self.terminal.restore(memory["terminal"])
+        self.scorer.restore(memory["scorer"])
+        self.feedback, self.seconds = memory["feedback"], memory["seconds"]
+
+    def record(self, frame: Frame, heard: Heard) -> ObserverRecord:
+        """Compare the frame with the truth."""
+        paths, sent = frame.paths[self.link], frame.sent[self.link.tx]
+        return self.scorer.record(frame.number, paths, sent, heard, frame.noise_power(self.link))
+
+
+class Exchange(Protocol):
+    """Exchange of reports between the terminals of one set of receivers."""
+
+    def step(
+        self,
+        frame: int,
+        heard: Mapping[Link, Heard],
+        symbols: Mapping[Link, SymbolCount],
+        late: Mapping[Link, Sequence[LateRecord]],
+    ) -> dict[str, View]:
+        """Return the fused tracks after a frame, by terminal and of all together (`SWARM`)."""
+        ...
+
+    def told(self, link: Link, frame: int, time: float) -> list[KnownBody]:
+        """Return the targets that a link's receiver knew of after a frame, at a time [s]."""
+        ...
+
+    def memory(self) -> dict[str, Any]:
+        """Return the state carried over to the next frame, for `restore`."""
+        ...
+
+    def restore(self, memory: Mapping[str, Any]) -> None:
+        """Go on from a `memory`."""
+        ...
+
+
+@dataclass
+class StationSet:
+    """One set of receivers: the station of every link, the exchange between them, and the record
+    of what they receive."""
+
+    stations: dict[Link, Station]
+    recorder: Recorder
+    swarm: Swarm
+    exchange: Exchange | None
+    fused: SwarmScorer
+
+    @classmethod
+    def of(
+        cls, setup: Setup, terminal: Callable[[Link], Terminal], receivers: Receivers
+    ) -> StationSet:
+        """Before the first frame; `receivers` are the settings that the terminals have."""
+        timetable, cooperation = setup.timetable, setup.scenario.cooperation
+        return cls(
+            {link: Station(setup, link, terminal(link), receivers) for link in timetable.all_links},
+            Recorder(timetable, [state.name.lower() for state in TerminalState]),
+            setup.swarm,
+            None if cooperation == "none" else COOPERATIONS.load(cooperation)(setup),
+            SwarmScorer(timetable),
+        )
+
+    def reports(self, link: Link, frame: int) -> list[KnownBody]:
+        """Return what the link's receiver knows from others in a frame: what it knew
+        `PREFETCHED_FRAMES` frames before, so that no frame waits for the one before."""
+        when = self.recorder.timetable.epoch(frame, link.tx)
+        return self.exchange.told(link, frame - PREFETCHED_FRAMES, when) if self.exchange else []
+
+    def record(self, frame: Frame, heard: Mapping[Link, Heard], snapshot: bool) -> None:
+        """Compare a frame with the truth, and exchange reports after it."""
+        timetable, number = self.recorder.timetable, frame.number
+        records = {link: self.stations[link].record(frame, h) for link, h in heard.items()}
+        late = {link: self.stations[link].scorer.late(number, h) for link, h in heard.items()}
+        pictures: dict[str, PictureRecord] = {}
+        if self.exchange is not None:
+            symbols = {link: o.symbols for link, o in records.items()}
+            views = self.exchange.step(number, heard, symbols, late)
+            poses = {name: self.swarm.poses(view.time) for name, view in views.items()}
+            pictures = self.fused.record(number, views, records, poses)
+        self.recorder.add(
+            FrameRecord(
+                frame=number,
+                time=timetable.epoch(number),
+                modulated=timetable.modulated(number),
+                poses=frame.poses,
+                observers={timetable.labels[link]: o for link, o in records.items()},
+                snapshot=snapshot,
+                uses=frame.uses,
+                dropped=frame.dropped,
+                pictures=pictures,
+            )
+        )
+        for link, frames in late.items():
+            for one in frames:
+                self.recorder.amend(link, one)
+
+    def blocks(self) -> dict[str, Any]:
+        """`terminals`, `links` and `swarm` of the summary."""
+        return self.recorder.blocks()
+
+    def costs(self) -> dict[str, float]:
+        """Processor seconds of reception and tracking by link."""
+        return {str(link): o.seconds for link, o in self.stations.items()}
+
+    def memory(self, first: int, carried: Mapping[Link, dict[str, Any]]) -> dict[str, Any]:
+        """Return the rows from a frame on, earlier ones that have changed, and what every terminal
+        carries over."""
+        recorder, exchange = self.recorder, self.exchange
+        return {
+            "rows": [recorder.row(i) for i in range(first, len(recorder))],
+            "amended": [[i, recorder.row(i)] for i in sorted(recorder.amended) if i < first],
+            "stations": {str(k): o.memory(carried.get(k)) for k, o in self.stations.items()},
+            "exchange": None if exchange is None else exchange.memory(),
+            "fused": self.fused.memory(),
+        }
+
+    def restore(self, memory: Mapping[str, Any]) -> None:
+        """Take up what the terminals carried over."""
+        for link, station in self.stations.items():
+            station.restore(memory["stations"][str(link)])
+        if self.exchange is not None:
+            self.exchange.restore(memory["exchange"])
+        self.fused.restore(memory["fused"])
