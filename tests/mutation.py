@@ -36,8 +36,8 @@ import numpy as np
 
 ROOT = Path(__file__).parent.parent
 TESTS_OF = {
-    "frame/waveform.py": "test_waveform test_ifsignal",
-    "frame/payload.py": "test_payload test_receive_data",
+    "frame/waveform.py": "test_waveform test_truths test_ifsignal",
+    "frame/payload.py": "test_payload test_truths test_receive_data",
     "frame/antennas.py": "test_arrays test_view test_ifsignal",
     "frame/timetable.py": "test_timetable test_randomness",
     "randomness.py": "test_randomness test_noise",
@@ -54,10 +54,10 @@ TESTS_OF = {
     "signal/separable.py": "test_separable",
     "signal/if_signal.py": "test_ifsignal test_hard_signal",
     "signal/noise.py": "test_noise",
-    "frame/level.py": "test_linkbudget",
+    "frame/level.py": "test_linkbudget test_truths",
     "propagation/free_space.py": "test_propagation",
-    "propagation/legs/geometry.py": "test_propagation test_raytrace_scenes",
-    "propagation/rcs.py": "test_propagation",
+    "propagation/legs/geometry.py": "test_propagation test_truths test_raytrace_scenes",
+    "propagation/rcs.py": "test_propagation test_truths",
     "propagation/raytrace.py": "test_raytrace_scenes test_chains",
     "propagation/legs/chains.py": "test_chains",
     "propagation/legs/images.py": "test_chains test_raytrace_scenes",

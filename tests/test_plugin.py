@@ -12,6 +12,7 @@ import pytest
 
 from isac_rt import registry
 from isac_rt.runtime import UserError
+from isac_rt.sweep import status
 
 HERE = Path(__file__).parent
 SCENARIO = """\
@@ -39,79 +40,106 @@ keep: [tracks]
 """
 
 
-@pytest.fixture
-def isac_rt(tmp_path):
-    """Run the command line where the example package is installed."""
-    (tmp_path / "scenario.yaml").write_text(SCENARIO)
-    (tmp_path / "sweep.yaml").write_text(SWEEP)
-    (tmp_path / "data.yaml").write_text(DATA)
+COUNT = ("count-walls", "scenario.yaml")
+HELP = ("--help",)
+ATTENUATED = ("run", "scenario.yaml", "--out", "attenuated")
+FREE = ("run", "scenario.yaml", "--out", "free", "--set", "propagation.model=free_space")
+WEAK = ("--set", "propagation.model=free_space", "--set", "noise.snr_db=-25")
+OWN = ("run", "scenario.yaml", "--out", "own", *WEAK)
+THEIRS = ("run", "scenario.yaml", "--out", "theirs", *WEAK)
+for part in ("clutter_detector=far", "passive_detector=plain", "symbol_decision=late"):
+    THEIRS += ("--set", f"receivers.{part}")
+DATASET = ("dataset", "data.yaml", "--out", "data", "--workers", "2")
+SWEPT = ("sweep", "sweep.yaml", "--out", "points", "--workers", "2")
+PROGRAM = """
+import contextlib, io, json, sys, traceback
+from isac_rt.cli.cli import main
+
+def said(command):
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        try:
+            status = main(command)
+        except SystemExit as end:
+            status = end.code
+        except Exception:
+            traceback.print_exc()
+            status = "raised"
+    return status or 0, out.getvalue()
+
+if __name__ == "__main__":
+    print(json.dumps([said(command) for command in json.loads(sys.argv[1])]))
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    place = tmp_path_factory.mktemp("plugin")
+    (place / "scenario.yaml").write_text(SCENARIO)
+    (place / "sweep.yaml").write_text(SWEEP)
+    (place / "data.yaml").write_text(DATA)
+    (place / "program.py").write_text(PROGRAM)
+    return place
+
+
+@pytest.fixture(scope="module")
+def printed(folder) -> dict[tuple[str, ...], str]:
+    """Run the commands in one process where the example package is installed."""
+    commands = (COUNT, HELP, ATTENUATED, FREE, OWN, THEIRS, DATASET, SWEPT)
     path = os.pathsep.join([str(HERE.parent), str(HERE / "plugin")])
+    ended = subprocess.run(
+        [sys.executable, "program.py", json.dumps(commands)],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+    assert ended.returncode == 0, ended.stderr
+    answers = dict(zip(commands, json.loads(ended.stdout), strict=True))
+    assert not any(status for status, _ in answers.values()), (answers, ended.stderr)
+    return {command: text for command, (_, text) in answers.items()}
 
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "isac_rt.cli.cli", *arguments],
-            capture_output=True,
-            text=True,
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": path},
-        )
 
-    return run
-
-
-def test_a_command_of_another_package(isac_rt):
+def test_a_command_of_another_package(printed):
     """Planted bug: `list_commands` without those that are installed."""
-    assert isac_rt("count-walls", "scenario.yaml").stdout == "2 faces\n"
-    assert "count-walls" in isac_rt("--help").stdout
+    assert printed[COUNT] == "2 faces\n"
+    assert "count-walls" in printed[HELP]
 
 
-def test_a_city_and_a_propagation_model_of_another_package(isac_rt, tmp_path):
+@pytest.mark.usefixtures("printed")
+def test_a_city_and_a_propagation_model_of_another_package(folder):
     """Planted bug: `make_propagation` takes free space for every model that is not its own."""
-    done = isac_rt("run", "scenario.yaml", "--out", "out")
-    assert done.returncode == 0, done.stderr
-    done = isac_rt("run", "scenario.yaml", "--out", "free", "--set", "propagation.model=free_space")
-    assert done.returncode == 0, done.stderr
     import xarray as xr
 
     power = [
-        xr.open_dataset(tmp_path / name / "results.nc", engine="h5netcdf").reference_power.values
-        for name in ("out", "free")
+        xr.open_dataset(folder / name / "results.nc", engine="h5netcdf").reference_power.values
+        for name in ("attenuated", "free")
     ]
     assert power[0].size and (power[0] > 0).any()
     both = (power[0] > 0) & (power[1] > 0)
     assert both.any()
     # noise alone changes the ratio; 10 dB SNR in some 10^6 samples
     assert power[0][both] / power[1][both] == pytest.approx(0.01, rel=0.02)
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["city"]["name"] == "wall"
+    assert json.loads((folder / "attenuated/summary.json").read_text())["city"]["name"] == "wall"
 
 
-def test_detectors_and_a_symbol_reader_of_another_package(isac_rt, tmp_path):
+@pytest.mark.usefixtures("printed")
+def test_detectors_and_a_symbol_reader_of_another_package(folder):
     """A detector that finds nothing, and a reader that is always wrong. Planted bug: the tables of
     the chain asked first."""
-    parts = ("clutter_detector=far", "passive_detector=plain", "symbol_decision=late")
-    for name, changes in (("own", ()), ("theirs", parts)):
-        options = [word for change in changes for word in ("--set", f"receivers.{change}")]
-        power = ("--set", "propagation.model=free_space", "--set", "noise.snr_db=-25")
-        done = isac_rt("run", "scenario.yaml", "--out", name, *power, *options)
-        assert done.returncode == 0, done.stderr
     links = [
-        json.loads((tmp_path / name / "summary.json").read_text())["links"]
+        json.loads((folder / name / "summary.json").read_text())["links"]
         for name in ("own", "theirs")
     ]
     assert links[0]["AT->PT1"]["ser_delay"] == 0 and links[1]["AT->PT1"]["ser_delay"] == 1
     assert links[0]["AT->AT"]["hit_rate"] == 1 and links[1]["AT->AT"]["hit_rate"] == 0
 
 
-def test_a_data_set_over_parts_of_another_package(isac_rt):
-    """Planted bug: as for sweeps."""
-    done = isac_rt("dataset", "data.yaml", "--out", "data", "--workers", "2")
-    assert done.returncode == 0, done.stderr
-
-
-def test_a_sweep_over_parts_of_another_package(isac_rt):
+@pytest.mark.usefixtures("printed")
+def test_a_data_set_and_a_sweep_over_parts_of_another_package(folder):
     """Planted bug: workers that are not given the client's path."""
-    done = isac_rt("sweep", "sweep.yaml", "--out", "points", "--workers", "2")
-    assert done.returncode == 0, done.stderr
+    assert len(list((folder / "data").glob("*/*.tar"))) == 2
+    assert status(folder / "points").done == 2
 
 
 def test_names_that_nobody_registered_are_refused():

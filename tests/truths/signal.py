@@ -46,6 +46,8 @@ def numbers_of_the_frame() -> float:
         (w.frame_duration, 7.7824e-3),
         (w.range_cell(2), 0.249827),
         (w.range_cell(1), 0.499654),
+        (w.bits_per_frame(2), 3591),
+        (w.bits_per_frame(4), 3942),
         (w.bits_per_frame(8), 4293),
         (w.bits_per_frame(16), 4644),
         (w.num_resource_blocks, 19),
