@@ -280,20 +280,6 @@ def test_cleaned_spectra_against_their_sums():
             assert abs(found[m, 1, k % 48, p] - truth) < 3e-5  # complex64: 1e-7 of sums of some 20
 
 
-@pytest.mark.parametrize("order", [2, 4, 8, 16])
-@pytest.mark.parametrize("rate", [-29.4, 17.3])
-def test_noise_free_symbols_are_right_at_the_ends_of_the_velocity(order: int, rate: float):
-    """Planted bugs: running product with the index of the transition, conjugate on the later chirp,
-    group offsets forgotten."""
-    w, schedule, payload = frame(order)
-    signal = cube(w, schedule, payload, [Path(71.39, rate, 1j, ARRIVAL, DEPARTURE)], FEW)
-    found = demodulate(signal, predict(71.42, rate + 0.05), order)
-    assert np.array_equal(found.raw, payload.delay_symbols)
-    assert np.array_equal(found.transitions, payload.transitions)
-    assert np.array_equal(found.bits, payload.bits)
-    assert np.abs(found.phases - payload.phases).max() < 1e-12  # rounding
-
-
 @pytest.mark.parametrize(
     ("cell", "error"),
     [(0.0, 0.0), (22.5, 0.0), (22.5, 0.4), (22.2, -0.4), (255.9, 0.3), (600.4, 0.2), (700.0, -0.3)],

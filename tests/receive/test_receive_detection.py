@@ -176,20 +176,6 @@ def test_method_follows_the_schedule():
 # --- CFAR
 
 
-@pytest.mark.parametrize(
-    ("rate", "looks", "cells"), [(1e-6, 45, 30.0), (1e-3, 9, 4.7), (1e-2, 1, 11.0)]
-)
-def test_factor_of_one_side_is_the_f_distribution(rate: float, looks: int, cells: float):
-    """A cell over a mean of n cells is F(2 L, 2 L n). Planted bug: looks of the cell used for the
-    training mean."""
-    quadrature = 1e-4
-    assert greatest_of_factor(rate, looks, cells, 0.0) == pytest.approx(
-        stats.f.isf(rate, 2 * looks, 2 * looks * cells), rel=quadrature
-    )
-    many = greatest_of_factor(rate, looks, 1e6, 1e6)
-    assert many == pytest.approx(stats.gamma(looks, scale=1 / looks).isf(rate), rel=1e-3)
-
-
 def test_factor_of_the_greater_side_by_drawing():
     """Planted bug: the smaller side."""
     rng, n = np.random.default_rng(9), 400_000

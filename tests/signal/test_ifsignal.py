@@ -295,26 +295,6 @@ def test_filter(method):
     )  # group m - 1, two maximal delays late
 
 
-@pytest.mark.parametrize("method", [Direct(), Exact()])
-def test_target_at_half_a_metre_is_seen_spherically(method):
-    """Phase differences of the elements follow the distances to the point. Planted bug: plane
-    waves."""
-    w = Waveform(num_chirps=3, num_groups=1, filter_transition=SKIRT)
-    u = np.array([[0.48, 0.8, 0.36]])
-    samples = tone(w, delay=0.004, arrival=u, rx_radius=0.5, method=method)[
-        0, :, 0, w.num_samples // 2
-    ]
-    elements = antennas(w).rx_positions @ pose(0.2, 1.0, 0.3).rotation.T
-    distance = np.linalg.norm(0.5 * u - elements, axis=1)
-    frequency = w.effective_carrier - 0.004 * w.sampling_rate
-    expected = np.exp(2j * np.pi * frequency / C * (distance - distance[0]))
-    plane = np.exp(-2j * np.pi * frequency / C * ((elements - elements[0]) @ u[0]))
-    assert np.abs(plane - expected).max() > 1e-3  # the case is not trivial
-    np.testing.assert_allclose(
-        samples / samples[0], expected, atol=1e-5
-    )  # e^2 slope pi and rounding
-
-
 def test_linear_in_paths_and_gains():
     w = SMALL
     rng = np.random.default_rng(8)
