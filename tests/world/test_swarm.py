@@ -30,36 +30,6 @@ def test_attitude_is_a_right_handed_frame():
     assert north == pytest.approx(np.eye(3))  # facing north, east is to the right
 
 
-def test_vertical_boresight_has_an_attitude():
-    r = attitude(np.array([0.0, 0.0, -1.0]))
-    assert r.T @ r == pytest.approx(np.eye(3), abs=1e-14)
-
-
-def test_spline_derivatives_match_differences():
-    """Velocity and acceleration against central differences of the position; planted bug:
-    derivative orders swapped."""
-    trajectory, h = Trajectory(Uav(role="target", waypoints=WAYPOINTS)), 1e-4
-    for t in (0.37, 1.3, 2.05, 3.71):
-        before, now, after = (trajectory.pose(s) for s in (t - h, t, t + h))
-        # discretisation: h^2/6 of the third derivative, about 1e-8 here; second difference loses
-        # 1e-15*20/h^2 = 2e-6
-        assert (after.position - before.position) / (2 * h) == pytest.approx(now.velocity, abs=1e-6)
-        assert (after.position - 2 * now.position + before.position) / h**2 == pytest.approx(
-            now.acceleration, abs=2e-3
-        )
-    for w in WAYPOINTS:
-        assert trajectory.pose(w.time_s).position == pytest.approx(
-            np.array(w.position_m), abs=1e-12
-        )
-
-
-def test_beyond_the_waypoints_it_flies_straight_on():
-    trajectory = Trajectory(Uav(role="target", waypoints=WAYPOINTS))
-    end, later = trajectory.pose(4.1), trajectory.pose(6.0)
-    assert later.position == pytest.approx(end.position + 1.9 * end.velocity)
-    assert not later.acceleration.any()
-
-
 def test_many_positions_at_once_are_those_of_the_poses():
     """Bit for bit, beyond the waypoints too. Planted bug: no straight way beyond them."""
     times = np.linspace(-1.3, 9.7, 57)
@@ -130,22 +100,18 @@ def natural_spline(times, values, t):
     return np.stack([place, velocity, (m[i] * left + m[i + 1] * right) / h[i]])
 
 
-def test_the_curve_through_waypoints_is_the_natural_spline():
-    """Between the waypoints, and straight on before the first and after the last, at which it has
-    no acceleration. Planted bugs: other conditions at the ends; the line before the start in the
-    wrong direction."""
+def test_beyond_the_waypoints_it_flies_straight_on():
+    """Before the first and after the last, at which it has no acceleration. Planted bugs: other
+    conditions at the ends; the line before the start in the wrong direction."""
     trajectory = Trajectory(Uav(role="target", waypoints=WAYPOINTS))
-    times = np.array([w.time_s for w in WAYPOINTS])
-    values = np.array([w.position_m for w in WAYPOINTS])
-    for t in (0.0, 0.41, 1.3, 2.2, 3.3, 4.0999):
-        assert trajectory.pose(t).position == pytest.approx(
-            natural_spline(times, values, t)[0], abs=1e-12
-        )
     first = trajectory.pose(0.0)
     assert first.acceleration == pytest.approx(np.zeros(3), abs=1e-12)
     before = trajectory.pose(-1.5)
     assert before.position == pytest.approx(first.position - 1.5 * first.velocity)
     assert before.velocity == pytest.approx(first.velocity) and not before.acceleration.any()
+    last, after = trajectory.pose(4.1), trajectory.pose(6.0)
+    assert after.position == pytest.approx(last.position + 1.9 * last.velocity)
+    assert not after.acceleration.any()
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])
