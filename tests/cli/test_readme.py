@@ -37,7 +37,7 @@ def block(language: str) -> str:
 def shortened(command: str) -> list[str]:
     words = shlex.split(command)[1:]
     if words[0] == "run" and "--frames" not in words:
-        words += ["--frames", "5"]
+        words += ["--frames", "4"]
     return words
 
 
