@@ -20,12 +20,14 @@ import hashlib
 import importlib.metadata
 import json
 import math
+import mmap
 import os
 import platform
 import pwd
 import re
 import secrets
 import stat
+import struct
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -49,6 +51,7 @@ HDF5_PACKING = 1100
 """Bytes that one byte of an HDF5 file can stand for: deflate makes 1032 of one."""
 MAX_HDF5_PIECE = 2**24
 """A piece (chunk) that is larger than its dataset has at most so many bytes."""
+_HEAP = b"GCOL\x01\0\0\0"  # signature and version of a global heap
 MAX_HDF5_DEPTH = 8
 MOST_JSON_BYTES = 16 * 1024**2
 """No file of JSON is larger: nothing but empty lists takes 53 times its size."""
@@ -192,6 +195,27 @@ def read_whole(file: Path, most: int = MOST_BYTES) -> bytes:
         if status.st_size > most:
             raise OSError(errno.EFBIG, f"is larger than {most} bytes", str(file))
         return opened.read()
+
+
+def check_heaps(content: bytes | mmap.mmap) -> None:
+    """Refuse HDF5 whose global heaps hold pieces that do not follow on each other: libhdf5 walks
+    such a heap for ever.
+
+    Raises
+    ------
+    ValueError
+    """
+    at = content.find(_HEAP)
+    while at >= 0:
+        end = min(at + int.from_bytes(content[at + 8 : at + 16], "little"), len(content))
+        piece = at + 16
+        while piece + 16 <= end:
+            index, size = struct.unpack_from("<H6xQ", content, piece)
+            step = 16 + -(-size // 8) * 8 if index else size
+            if not 16 <= step <= end - piece:
+                raise ValueError(f"a heap of HDF5 at byte {at} is bent")
+            piece += step
+        at = content.find(_HEAP, at + len(_HEAP))
 
 
 def check_unfolded(opened: Any, file_bytes: int, most: float, refuse_links: bool = True) -> None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import io
 import os
 import resource
 import signal
+import struct
 import subprocess
 import sys
 from contextlib import nullcontext
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -303,3 +306,18 @@ def test_many_processes_keep_into_one_small_folder(tmp_path):
     ]
     assert [run.wait(60) for run in runs] == [0, 0, 0, 0]
     assert not list(tmp_path.glob("*/.*.tmp"))
+
+
+def test_a_heap_that_libhdf5_walks_for_ever_is_refused():
+    """A piece of no size, and one whose size wraps. Planted bug: pieces of no size passed."""
+    made = io.BytesIO()
+    with h5py.File(made, "w") as whole:
+        whole["names"] = np.array(["one", "another"], h5py.string_dtype())
+    content = made.getvalue()
+    storage.check_heaps(content)
+    first = content.index(b"GCOL") + 16
+    for index, size in ((0, 0), (1, 2**64 - 16)):
+        bent = bytearray(content)
+        struct.pack_into("<H6xQ", bent, first, index, size)
+        with pytest.raises(ValueError, match="heap of HDF5"):
+            storage.check_heaps(bytes(bent))

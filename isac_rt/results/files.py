@@ -12,6 +12,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import mmap
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +26,7 @@ from isac_rt.storage import (
     BAD_DATA,
     MOST_JSON_BYTES,
     StorageError,
+    check_heaps,
     check_unfolded,
     read_whole,
     write_whole,
@@ -91,6 +93,10 @@ def read_dataset(file: Path) -> xr.Dataset:
 
     if not file.is_file():
         raise OSError(f"{file} is no file" if file.exists() else f"there is no {file}")
+    with open(file, "rb") as read:
+        if file.stat().st_size:
+            with mmap.mmap(read.fileno(), 0, access=mmap.ACCESS_READ) as content:
+                check_heaps(content)
     with h5py.File(file) as whole:
         check_unfolded(whole, file.stat().st_size, available_memory() or math.inf)
         whole.attrs.get("_nc3_strict")  # where this fails, h5netcdf cannot close what it opened

@@ -19,7 +19,7 @@ import numpy as np
 
 from isac_rt.extensions.hardware.types import CaptureError
 from isac_rt.runtime import shortly
-from isac_rt.storage import BAD_DATA, check_unfolded, read_whole
+from isac_rt.storage import BAD_DATA, check_heaps, check_unfolded, read_whole
 
 Tree = dict[str, Any]
 """Names to arrays, and to the arrays of a struct by name."""
@@ -198,6 +198,7 @@ def _read_hdf5(content: bytes) -> Tree:
         return np.asarray(value["real"] + 1j * value["imag"] if parts else value).T
 
     found: Tree = {}
+    check_heaps(content)
     with h5py.File(io.BytesIO(content), "r") as opened:
         check_unfolded(opened, len(content), MOST_BYTES, refuse_links=False)
         for name in opened:
