@@ -119,6 +119,7 @@ TESTS_OF = {
     "propagation/store.py": "test_keys test_sweep",
     "simulation/resume.py": "test_resume",
     "simulation/simulate.py": "test_resume test_simulate test_fall_back",
+    "simulation/stations.py": "test_resume test_simulate test_handed",
     "sweep/definition.py": "test_sweep test_keys",
     "sweep/execute.py": "test_sweep test_trouble",
     "sweep/outcomes.py": "test_sweep test_trouble",

@@ -701,7 +701,7 @@ OF_TESTS = (
     (
         "test_resume::test_everything_that_is_carried_over_is_taken_up",
         Bug(
-            "simulation/simulate.py",
+            "simulation/stations.py",
             """            "feedback": self.feedback,
             "seconds\"""",
             """            "feedback": {"answers": 0, "corrections": 0},

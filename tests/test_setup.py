@@ -23,6 +23,7 @@ def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("make"), reason="needs make")
 def test_an_environment_that_works_stays_where_a_new_one_cannot_be_made(tmp_path):
     """Without a network, after `pyproject.toml` got a newer time. Planted bug: `.venv` cleared

@@ -96,8 +96,10 @@ def obstacles(city: CityMesh, places: np.ndarray) -> CityMesh:
     encloses all of their places (N, 3), local.
 
     A room is a connected surface as large as the whole mesh, so that nothing lies outside it, or
-    one whose faces look inward, unlike a building's.
+    one whose faces look inward, unlike a building's. Walls with two sides are a room in a room.
     """
+    if not city.num_faces:
+        return city
     sides = city.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
     graph = coo_matrix((np.ones(len(sides)), sides.T), shape=(len(city.vertices),) * 2)
     _, part = connected_components(graph, directed=False)
@@ -107,7 +109,7 @@ def obstacles(city: CityMesh, places: np.ndarray) -> CityMesh:
         if (own.min(axis=0) == low).all() and (own.max(axis=0) == high).all():
             shell = part[city.faces[:, 0]] == one
             if all(enclosed(city.of(shell), place) for place in places):
-                return city.of(~shell)
+                return obstacles(city.of(~shell), places)
     if all(enclosed(city, place) and _looks_inward(city, place) for place in places):
         return city.of(np.zeros(city.num_faces, bool))
     return city

@@ -62,6 +62,7 @@ def folder(tmp_path_factory) -> Path:
     return place
 
 
+@pytest.mark.slow
 @pytest.mark.sionna
 def test_the_quick_commands_run_in_their_order(folder, monkeypatch, capsys):
     """One after the other, since some need what others wrote. Planted bug: a renamed option."""

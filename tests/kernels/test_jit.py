@@ -107,8 +107,11 @@ def test_a_changed_line_runs(copy, file, old, new, answer):
     "body",
     [
         "{'a': x, 'b': 2}['a'] + 1",
-        "np.linalg.solve(np.eye(3), np.full(3, 1.0 * x)).sum() + np.random.rand()",
-        "sorted([str(n) for n in range(x, x + 40)])[0]",
+        pytest.param(
+            "np.linalg.solve(np.eye(3), np.full(3, 1.0 * x)).sum() + np.random.rand()",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param("sorted([str(n) for n in range(x, x + 40)])[0]", marks=pytest.mark.slow),
         "len(set([x, 3, x + 1])) + math.erf(x) + abs((x + 2j) ** 0.5)",
     ],
 )

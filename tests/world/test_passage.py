@@ -195,6 +195,7 @@ def test_the_way_keeps_to_the_flight():
 
 
 ROOM = trimesh.creation.box((10, 8, 3)).apply_translation((0, 0, 1.5))
+OUTSIDE = trimesh.creation.box((10.6, 8.6, 3.6)).apply_translation((0, 0, 1.5))
 CUPBOARD = trimesh.creation.box((2, 1, 2)).apply_translation((-3, 2, 1))
 GARDEN = trimesh.creation.box((60, 60, 1)).apply_translation((0, 0, -0.6))
 L_SHAPED = trimesh.creation.extrude_polygon(
@@ -216,7 +217,15 @@ def indoors(folder, *meshes, person=(0.8, 1, 1.1)):
 
 
 @pytest.mark.parametrize(
-    "meshes", [(ROOM,), (ROOM, CUPBOARD), (L_SHAPED,), (INWARD,), (INWARD, CUPBOARD, GARDEN)]
+    "meshes",
+    [
+        (ROOM,),
+        (ROOM, CUPBOARD),
+        (OUTSIDE, ROOM, CUPBOARD),
+        (L_SHAPED,),
+        (INWARD,),
+        (INWARD, CUPBOARD, GARDEN),
+    ],
 )
 def test_a_closed_room_is_a_place_to_fly_in(tmp_path, meshes):
     """Where nothing lies outside it, or its walls look inward. It was refused as a building."""
@@ -227,6 +236,7 @@ def test_a_closed_room_is_a_place_to_fly_in(tmp_path, meshes):
     ("meshes", "person", "said"),
     [
         ((ROOM, CUPBOARD), (-3.1, 2.2, 1.1), "swarm.person: starts inside"),
+        ((OUTSIDE, ROOM, CUPBOARD), (-3.1, 2.2, 1.1), "swarm.person: starts inside"),
         ((ROOM,), (0.8, 9.7, 1.1), "swarm.radar: starts inside"),
         ((ROOM, GARDEN), (0.8, 1, 1.1), "turn the faces of a room inward"),
         ((L_SHAPED,), (3.5, 2.5, 1.1), "swarm.radar: starts inside"),
