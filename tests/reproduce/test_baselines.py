@@ -104,6 +104,7 @@ def test_fmcw_folds_its_velocity_at_a_third():
 
 
 @pytest.mark.parametrize(("snr_db", "rate"), [(-44, 0.54), (-38, 1.0)])
+@pytest.mark.slow
 def test_fmcw_hit_rate(snr_db, rate):
     """Prototype: 0.54 of 24 frames at -44 dB, 1 from -40 dB up. Both samples are binomial: the
     bounds join a 1e-3 interval on the prototype's rate and ours. Planted bug: one channel instead

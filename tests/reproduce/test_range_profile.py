@@ -42,6 +42,7 @@ def scene(seed: int) -> tuple[list[Path], Prediction]:
 
 
 @pytest.mark.parametrize("snr_db", [-18.0, -8.0])
+@pytest.mark.slow
 def test_the_profile_reads_what_the_strongest_cell_does_not(snr_db: float):
     """Per-sample SNR of the line of sight. The strongest cell is one of the clutter's in most
     chirps; the learned profile has at most one symbol in 180 wrong. Planted bug: correlation not

@@ -557,6 +557,7 @@ def whole(files: list[Path]) -> bool:
     return all(json.loads(f.read_text())["status"] == "done" for f in files)
 
 
+@pytest.mark.slow
 def test_a_killed_client_loses_nothing_and_repeats_nothing(folder):
     """SIGKILL when five points are done; the same command finishes the rest, and does not touch
     what was there."""

@@ -402,6 +402,7 @@ def test_a_sweep_on_a_full_disk_goes_on_once_there_is_room(folder, small_disk):
     same(open_sweep(out), open_sweep(folder / "calm"))
 
 
+@pytest.mark.slow
 def test_a_point_that_takes_its_workers_with_it_is_left(folder):
     """It is left and said, and the points that ran beside it are done. Planted bugs: recorded as
     failed; a dead process that is not replaced."""
