@@ -30,6 +30,7 @@ TITLES = {
     "detectors": "Detectors in the clutter of a city's mesh",
     "ghosts": "Ghost tracks in a street and a geometric test of them",
     "city": "Receivers that know the city in several cities, with several seeds",
+    "flights": "Goals of tracking over any folder of scenes (--scenes), or over drawn ones",
     "hardware": "What real front ends do to data, floors, ranges and flights",
     "self_calibration": "Errors of the elements found in flight: bounds, and a flight over Munich",
     "claims": "Claims of the text that have no figure",

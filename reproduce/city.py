@@ -223,7 +223,7 @@ def _data(found: Mapping[str, Outcomes]) -> Iterator[dict[str, Any]]:
     of its receiver costs."""
     for place, outcomes in found.items():
         for link in outcomes[0]["by_frame"] if outcomes else ():
-            tables = [np.array(o["by_frame"][link]).reshape(-1, 6) for o in outcomes]
+            tables = [np.array(o["by_frame"][link]).reshape(-1, 7) for o in outcomes]
             data = np.concatenate([t[t[:, 3] > 0] for t in tables])
             lost = data[:, 2] > MISREAD * data[:, 3]
             yield {

@@ -169,7 +169,7 @@ class FlightJob(Job):
 
 def by_frame(results: Results) -> dict[str, list[list[int]]]:
     """Of every link the frames that its receiver heard: number, whether its transmitter is in sight
-    of it, wrong and all delay symbols, wrong and all DPSK symbols."""
+    of it, wrong and all delay symbols, wrong and all DPSK symbols, whether it was read."""
     d, out = results.dataset, {}
     uavs = list(d.uav.values)
     for i, (tx, rx) in enumerate(zip(d.transmitter.values, d.receiver.values, strict=True)):
@@ -177,7 +177,8 @@ def by_frame(results: Results) -> dict[str, list[list[int]]]:
         u = uavs.index(str(tx))
         sight = one.in_view.values[:, u] & ~one.shadowed.values[:, u]
         wrong, sent = one.symbol_errors.values, one.symbol_total.values
-        table = [d.frame.values, sight, wrong[:, 0], sent[:, 0], wrong[:, 1], sent[:, 1]]
+        counts = [wrong[:, 0], sent[:, 0], wrong[:, 1], sent[:, 1]]
+        table = [d.frame.values, sight, *counts, one.latency_frames.values >= 0]
         rows = zip(*(a.astype(int).tolist() for a in table), strict=True)
         heard = one.processed.values
         kept = [list(row) for row, there in zip(rows, heard, strict=True) if there]

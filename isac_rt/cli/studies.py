@@ -49,7 +49,11 @@ def reproduce(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 20260,
     seeds: Annotated[
-        int | None, typer.Option(min=1, max=1000, help="Flights at each place, for city.")
+        int | None, typer.Option(min=1, max=1000, help="Flights at each place, for city, flights.")
+    ] = None,
+    scenes: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Scenes or their pattern, for flights; else drawn."),
     ] = None,
 ) -> None:
     """Reproduce tables, figures and claims of the paper and judge them."""
@@ -62,24 +66,31 @@ def reproduce(
         say_table(("name", "what it shows"), rows, numbers=False)
         return
     check_names(names, experiments(), "table or figure")
-    if seeds is not None and set(names) != {"city"}:
-        raise InputProblem("--seeds goes with city alone; leave it out for other experiments")
+    for option, value, fits in (("seeds", seeds, "city flights"), ("scenes", scenes, "flights")):
+        if value is not None and not set(names) <= set(fits.split()):
+            raise InputProblem(
+                f"--{option} goes with {fits.replace(' ', ' or ')} alone; leave it out for other "
+                "experiments"
+            )
     for name in dict.fromkeys(names):
         folder = out if out is not None else Path("runs") / "reproduction" / name
         with ending_soon_after_interrupt(folder):
-            _reproduce(name, folder, quick, seed, seeds)
+            _reproduce(name, folder, quick, seed, seeds, scenes)
 
 
-def _reproduce(name: str, folder: Path, quick: bool, seed: int, seeds: int | None) -> None:
+def _reproduce(
+    name: str, folder: Path, quick: bool, seed: int, seeds: int | None, scenes: Path | None
+) -> None:
     from isac_rt.results.files import check_folder
 
     check_folder(folder)
     from reproduce import experiment
     from reproduce.city_flights import repeated
+    from reproduce.flights import over
     from reproduce.montecarlo import kept_in
     from reproduce.outcome import write
 
-    with kept_in(folder / "frames"), repeated(seeds):
+    with kept_in(folder / "frames"), repeated(seeds), over(scenes):
         outcome = with_progress(lambda report: experiment(name)(quick, seed, report), name)
     files = write(outcome, folder)
     colours = {"holds": "green", "holds under a condition": "yellow", "does not hold": "red"}

@@ -1,0 +1,141 @@
+"""Scenes drawn at random free places of six cities, for `reproduce.flights`.
+
+Even draws are for looking at while receivers are built, odd ones for reporting. Six draws of a kind
+have all cities and all formations, 36 each formation in each city.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from isac_rt.cli.siting import Site
+from isac_rt.document import ScenarioError, ScenarioWarning
+from isac_rt.randomness import generator
+from isac_rt.scenario.tree import Scenario
+from isac_rt.simulation.setup import city_of, prepare
+from isac_rt.storage import write_whole
+from isac_rt.sweep.drawn import MOST_TRIES
+from isac_rt.world.passage import hits
+from reproduce import SCENES
+
+FRAMES = 15
+_BUILT_IN = "munich", "florence", "etoile", "san_francisco", "simple_street_canyon_with_cars"
+CITIES = (*({"source": "builtin", "name": name} for name in _BUILT_IN), None)
+"""Nodes `city`; None: the blocks of the base scene."""
+FORMATIONS = ("facing", "beside", "square", "crossing", "abreast", "hovering")
+PT_TURN_DEG = {"facing": (160, 200), "beside": (10, 40), "square": (75, 105)}
+"""Angle about the targets from the active to the first passive terminal; else any."""
+ARRAYS = ({}, {"rx_x": 4, "rx_z": 4}, {"rx_x": 12, "rx_z": 6})
+MOST_SPEED_MPS, HEIGHT_M, DISTANCE_M, SPACING_M = 25.0, (4.0, 30.0), (12.0, 25.0), 3.0
+"""Highest speed over ground; heights over it; from the active terminal to the middle of the
+targets; between targets in a row."""
+
+
+def write_drawn(folder: Path, count: int, seed: int) -> None:
+    """Write the draws that a folder lacks as `look_000.yaml`, `report_001.yaml` and so on."""
+    for number in range(count):
+        file = folder / f"{('look', 'report')[number % 2]}_{number:03}.yaml"
+        if not file.is_file():
+            write_whole(file, yaml.safe_dump(drawn(number, seed), sort_keys=False))
+
+
+def drawn(number: int, seed: int) -> dict[str, Any]:
+    """Return a scene as plain values, in which the AT sees half of the targets or more.
+
+    Raises
+    ------
+    ScenarioError  If no free place is found.
+    """
+    pair, kind = divmod(number, 2)
+    formation = FORMATIONS[(pair + pair // 6 + 3 * kind) % 6]
+    tree = yaml.safe_load((SCENES / "blocks_swarm.yaml").read_text(encoding="utf-8"))
+    tree |= {"name": f"{formation}_{number:03}", "seed": seed + number, "frames": FRAMES}
+    tree["city"] = CITIES[pair % 6] or tree["city"]
+    tree["array"] = ARRAYS[(pair // 2 + pair // 6 + kind) % 3]
+    city = city_of(Scenario.model_validate(tree))
+    corners = city.corners + city.origin
+    for attempt in range(MOST_TRIES):
+        rng = generator(seed, "flight", number, attempt)
+        site = _site(corners, rng)
+        if site is None:
+            continue
+        tree["swarm"] = _swarm(formation, site, rng)
+        at, *others = (np.array(uav["position_m"]) for uav in tree["swarm"].values())
+        hidden = [hits(corners, at, place)[0].size > 0 for place in others]
+        targets = [uav["role"] == "target" for uav in tree["swarm"].values()][1:]
+        if np.mean(np.array(hidden)[targets]) > 0.5:
+            continue
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ScenarioWarning)
+                prepare(Scenario.model_validate(tree))
+        except ScenarioError:  # through a wall, or into another
+            continue
+        return dict(tree)
+    raise ScenarioError(f"draw {number} found no free place in {MOST_TRIES} tries; take another")
+
+
+def _site(corners: np.ndarray, rng: np.random.Generator) -> Site | None:
+    """Draw a place over the ground of a city (F, 3, 3) and a heading; None beside its ground."""
+    points = corners.reshape(-1, 3)
+    x, y, _ = rng.uniform(*np.quantile(points, (0.1, 0.9), axis=0))
+    bottom, top = points[:, 2].min() - 1, points[:, 2].max() + 1
+    _, share = hits(corners, np.array([x, y, bottom]), np.array([x, y, top]))
+    if not share.size:
+        return None
+    z = bottom + share.min() * (top - bottom) + rng.uniform(*HEIGHT_M)
+    return Site(np.array([x, y, z]), rng.uniform(0, 2 * np.pi))
+
+
+def _swarm(formation: str, site: Site, rng: np.random.Generator) -> dict[str, Any]:
+    """Draw a swarm: its targets about a site, terminals that look at it about them."""
+    size = int(rng.integers(3, 13))
+    passive = 1 if size < 5 else int(rng.integers(1, 3))
+    speed = 0.0 if formation == "hovering" else rng.uniform(0, MOST_SPEED_MPS)
+    first, second = rng.uniform(*PT_TURN_DEG.get(formation, (0, 360))), rng.uniform(0, 360)
+    out = {}
+    for name, turn in zip(["AT", "PT1", "PT2"][: 1 + passive], (0.0, first, second), strict=False):
+        away = np.append(_along(np.deg2rad(180 + turn)), rng.uniform(-0.1, 0.1))
+        moving = -away * rng.uniform(0, speed / 2)
+        out[name] = _uav(site, rng.uniform(*DISTANCE_M) * away, moving)
+        out[name] |= {"role": "passive" if turn else "active"}
+        out[name]["boresight"] = _rounded(site.turn(-away[None])[0])
+    places, flights = _targets(formation, size - 1 - passive, rng)
+    for number, (place, flight) in enumerate(zip(places, speed * flights, strict=True), start=1):
+        out[f"U{number}"] = {"role": "target"} | _uav(site, place, flight)
+    return out
+
+
+def _targets(formation: str, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draw places about the middle [m] and velocities over the highest (count, 3)."""
+    row = SPACING_M * (np.arange(count) - (count - 1) / 2)
+    places = rng.uniform(-1, 1, (count, 3)) * [9, 9, 2]
+    heading, pace = rng.uniform(0, 2 * np.pi, count), rng.uniform(0.5, 1, count)
+    if formation == "abreast":
+        places[:, 0], places[:, 1], heading[:], pace[:] = row, 0, heading[0], 1
+    elif formation == "crossing":
+        heading = np.pi * (np.arange(count) % 2 - 0.5)
+        places[:, 0], places[:, 1] = -5 * np.sin(heading), row
+    flights = pace[:, None] * np.column_stack([_along(heading).T, np.zeros(count)])
+    return places, flights
+
+
+def _along(heading: Any) -> np.ndarray:
+    """Unit vectors (2, ...) at angles from north to east [rad]."""
+    return np.array([np.sin(heading), np.cos(heading)])
+
+
+def _uav(site: Site, place: np.ndarray, velocity: np.ndarray) -> dict[str, Any]:
+    return {
+        "position_m": _rounded(site.place(place[None])[0]),
+        "velocity_mps": _rounded(site.turn(velocity[None])[0]),
+    }
+
+
+def _rounded(vector: np.ndarray) -> list[float]:
+    return [float(v) for v in vector.round(3)]
