@@ -27,22 +27,28 @@ SETS = ("city", "plain", "paper")
 """The scenario's own receivers first."""
 SEEDS = 10
 """Of a full evaluation, unless told otherwise (`repeated`)."""
-_seeds: ContextVar[int | None] = ContextVar("seeds", default=None)
+_asked: ContextVar[tuple[int | None, Path | None]] = ContextVar("asked", default=(None, None))
 
 
 @contextmanager
-def repeated(seeds: int | None) -> Iterator[None]:
-    """Inside, full evaluations have so many seeds; None: `SEEDS`."""
-    token = _seeds.set(seeds)
+def repeated(seeds: int | None, scenes: Path | None = None) -> Iterator[None]:
+    """Set, inside, the seeds of full evaluations and the scenes of `reproduce.flights`; None: its
+    own."""
+    token = _asked.set((seeds, scenes))
     try:
         yield
     finally:
-        _seeds.reset(token)
+        _asked.reset(token)
 
 
 def seeds_wanted(quick: bool) -> int:
     """Seeds of an evaluation."""
-    return _seeds.get() or (1 if quick else SEEDS)
+    return _asked.get()[0] or (1 if quick else SEEDS)
+
+
+def scenes_wanted() -> Path | None:
+    """Folder or pattern of the scenes to fly."""
+    return _asked.get()[1]
 
 
 @dataclass(frozen=True)

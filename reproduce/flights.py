@@ -1,16 +1,15 @@
 """Goals of detection, tracking and data over any folder of scenes, each flown with several seeds.
 
-The points are those of a sweep: flights run in processes of their own, and a stopped evaluation
-goes on with the same command. A goal holds if every single flight meets it and the interval of the
-number over all scenes does, and holds under a condition if the means over seeds do.
+Flights are the points of a sweep: they run in processes of their own, and a stopped evaluation
+continues with the same command. A goal holds if every flight meets it and the interval over seeds
+does, and holds under a condition if the means over seeds do.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
-from contextvars import ContextVar
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,55 +20,64 @@ import pandas as pd
 from isac_rt.runtime import UserError
 from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
+from isac_rt.settings import plain_tree
 from reproduce.city import MISREAD, mean
-from reproduce.city_flights import Flights, Place, fly, outcomes_of, seeds_wanted
+from reproduce.city_flights import Flights, Place, fly, outcomes_of, scenes_wanted, seeds_wanted
 from reproduce.flights_drawn import write_drawn
 from reproduce.montecarlo import kept_folder
 from reproduce.outcome import Outcome, Progress, Verdict, judged
 
 QUICK_FRAMES, DRAWN = 10, 12
-_scenes: ContextVar[Path | None] = ContextVar("scenes", default=None)
+BOUND = "clutter_free"
+"""Key of a terminal's `bounds` that the tracks of passive terminals are held against."""
+Block = Mapping[str, Any]
 Values = dict[str, float]
-"""By terminal; "" is the fused picture or the whole run."""
-
-
-@contextmanager
-def over(scenes: Path | None) -> Iterator[None]:
-    """Set the scenes of `run` inside: a folder or a pattern of files; None: `DRAWN` drawn ones."""
-    token = _scenes.set(scenes)
-    try:
-        yield
-    finally:
-        _scenes.reset(token)
+"""By terminal or link; "" for all of them together."""
 
 
 @dataclass(frozen=True)
 class SceneFile(Place):
-    """A scene of the folder as its file states it."""
+    """A scene as its file states it."""
 
     def scenario(self, quick: bool) -> Scenario:
         """Read the file."""
         return load(Path(self.file), (), self.few if quick else None)
 
 
-def _files(kept: Path, seed: int) -> dict[str, Place]:
-    """Return the scenes to fly by name; drawn ones are written to `kept` first."""
-    chosen = _scenes.get()
+def _places(kept: Path, seed: int) -> dict[str, Place]:
+    """Return the scenes to fly by name, equal ones once; drawn ones are written to `kept` first."""
+    chosen = scenes_wanted()
     if chosen is None:
         chosen = kept / "scenes"
         write_drawn(chosen, DRAWN, seed)
     folder, pattern = (chosen, "*.yaml") if chosen.is_dir() else (chosen.parent, chosen.name)
-    files = sorted(file.resolve() for file in folder.glob(pattern))
+    files = sorted(folder.resolve().glob(pattern), reverse=True)
     if not files:
-        raise UserError(f"--scenes {chosen}: no scene is there; give a folder of YAML files")
-    return {file.stem: SceneFile(str(file), 0, QUICK_FRAMES) for file in files}
+        raise UserError(f"--scenes {chosen}: there is no scene; give a folder of YAML files")
+    places = [SceneFile(str(file), 0, QUICK_FRAMES) for file in files]
+    different = {str({**plain_tree(p.scenario(False)), "name": ""}): p for p in places}
+    return {Path(p.file).stem: p for p in reversed(different.values())}
 
 
-def _ratio(part: float, whole: float) -> float:
-    return part / whole if whole else np.nan
+def _ratio(part: float | None, whole: float | None) -> float:
+    return part / whole if whole and part is not None else np.nan
 
 
-def _terminals(role: str, value: Callable[[Mapping[str, Any]], float]) -> Callable[[Any], Values]:
+def _of_found(block: Block) -> float:
+    targets = block["apart"]["targets"]
+    return _ratio(targets["tracked"], (targets["hit_rate"] or 0) * targets["in_view"])
+
+
+def _of_bound(block: Block) -> float:
+    targets = block["apart"]["targets"]
+    return _ratio(targets["tracked"], (targets["bounds"][BOUND] or 0) * targets["in_view"])
+
+
+def _of_empty(block: Block) -> float:
+    return _ratio(block["gospa"]["total_m"], block["gospa"]["empty_m"])
+
+
+def _at(role: str, value: Callable[[Block], float]) -> Callable[[Block], Values]:
     """Return the measure that takes a value of each terminal of a role."""
     return lambda outcome: {
         name: value(block)
@@ -78,161 +86,94 @@ def _terminals(role: str, value: Callable[[Mapping[str, Any]], float]) -> Callab
     }
 
 
-def _of_found(block: Mapping[str, Any]) -> float:
-    targets = block["apart"]["targets"]
-    return _ratio(targets["tracked"], (targets["hit_rate"] or 0) * targets["in_view"])
+def _misread(outcome: Block) -> Values:
+    """Count the frames that were read and have most of their delay or DPSK symbols wrong."""
+    out = {}
+    for link, rows in outcome["by_frame"].items():
+        _, _, delay, delays, dpsk, dpsks, read = np.array(rows, int).reshape(-1, 7).T
+        wrong = (delay > MISREAD * delays) | (dpsk > MISREAD * dpsks)
+        out[link] = float((wrong & (read > 0)).sum())
+    return out
 
 
-def _of_bound(block: Mapping[str, Any]) -> float:
-    targets = block["apart"]["targets"]
-    return _ratio(targets["tracked"], (targets["bounds"][BOUND] or 0) * targets["in_view"])
+def _fused(value: Callable[[Block], float]) -> Callable[[Block], Values]:
+    """Return the measure that takes a value of the fused tracks, where there are any."""
+    return lambda outcome: {"": value(outcome["swarm"])} if outcome["swarm"] else {}
 
 
-BOUND = "clutter_free"
-"""Key of a terminal's `bounds` that tracks of passive terminals are held against."""
+def _switches(fused: Block) -> float:
+    return float(sum(target["switches"] for target in fused["targets"].values()))
 
 
-def _of_empty(gospa: Mapping[str, Any]) -> float:
-    return _ratio(gospa["total_m"] or np.nan, gospa["empty_m"] or 0)
-
-
-def _targets_of_empty(block: Mapping[str, Any]) -> float:
-    return _of_empty(block["apart"]["targets"]["gospa"])
-
-
-def _false(block: Mapping[str, Any]) -> float:
-    return float(block["false_tracks_per_frame"])
-
-
-def _fused(outcome: Mapping[str, Any]) -> Values:
-    return {"": _of_empty(outcome["swarm"]["gospa"])} if outcome["swarm"] else {}
-
-
-def _misread(outcome: Mapping[str, Any]) -> Values:
-    """Count the data frames of each link that count as read, most of their symbols wrong."""
-    return {link: float(misread(rows)) for link, rows in outcome["by_frame"].items()}
-
-
-def misread(rows: list[list[int]]) -> int:
-    """Count the frames that were read and have more than half of their delay or DPSK symbols wrong.
-
-    Parameters
-    ----------
-    rows : of a link, as `by_frame` has them
-    """
-    _, _, *counts, read = np.array(rows, int).reshape(-1, 7).T
-    wrong, sent = np.array(counts[::2]), np.array(counts[1::2])
-    return int(((wrong > MISREAD * sent).any(axis=0) & (read > 0)).sum())
-
-
-def _switches(outcome: Mapping[str, Any]) -> Values:
-    targets = (outcome["swarm"] or {"targets": {}})["targets"]
-    return {"": float(sum(t["switches"] for t in targets.values()))}
-
-
-def _seconds(outcome: Mapping[str, Any]) -> Values:
+def _seconds(outcome: Block) -> Values:
     spent = outcome["timing_s"]
     return {"": (spent["receive"] + spent["track"]) / outcome["scenario"]["frames"]}
 
 
 @dataclass(frozen=True)
 class Goal:
-    """One row of the table.
+    """A row of the table.
 
     Attributes
     ----------
     claim : in words
-    measure : takes it from the outcome of a flight
-    each : limit of every scene, None: no limit
-    all : limit of what `pool` makes of all scenes, None: no limit
-    least : whether limits are to be reached, else not exceeded
+    measure : takes its values from the outcome of a flight
+    each : limit in every scene, NaN: none
+    limit : of what `pool` makes of all scenes, NaN: none
+    least : whether limits are to be reached, else not to be exceeded
     """
 
     claim: str
-    measure: Callable[[Any], Values]
-    each: float | None = None
-    all: float | None = None
+    measure: Callable[[Block], Values]
+    each: float = np.nan
+    limit: float = np.nan
     least: bool = False
-    pool: Callable[[Any], Any] = np.nanmean
+    pool: Callable[[Any], Any] = np.mean
 
-    def table(self, found: Mapping[str, Any]) -> pd.DataFrame:
-        """Return the values of scenes and terminals (rows) by seed (columns)."""
-        rows = {
-            f"{scene} {name}".strip(): pd.Series([v[name] for v in values])
-            for scene, outcomes in found.items()
-            for values in [[self.measure(o) for o in outcomes]]
-            for name in values[0]
-        }
-        return pd.DataFrame(rows).T
+    def values(self, found: Mapping[str, Any]) -> pd.DataFrame:
+        """Return the values by scene and terminal (rows) and seed (columns)."""
+        flown = {scene: [self.measure(o) for o in outcomes] for scene, outcomes in found.items()}
+        rows = {f"{s} {n}".strip(): [v[n] for v in vs] for s, vs in flown.items() for n in vs[0]}
+        return pd.DataFrame.from_dict(rows, orient="index")
 
-    def meets(self, value: Any, limit: float | None) -> Any:
-        """Return whether values meet a limit; what is not a number asks for nothing."""
-        if limit is None:
-            return np.full(np.shape(value), True)
-        return np.isnan(value) | ((value >= limit) if self.least else (value <= limit))
-
-    def row(self, table: pd.DataFrame) -> dict[str, Any]:
-        """Judge the table."""
-        scenes = table.mean(axis=1)
-        known = scenes.dropna()
-        overall = mean([float(self.pool(table[seed].dropna())) for seed in table])
-        worst = (known.idxmin() if self.least else known.idxmax()) if len(known) else ""
-        fails = known.index[~self.meets(known, self.each)]
-        ends = [overall.low if self.least else overall.high]
-        sure = self.meets(table.to_numpy(), self.each).all() and not np.isnan(ends).any()
-        met = bool(self.meets(overall.value, self.all)) and not len(fails) and bool(len(known))
-        return {
-            "goal": self.claim,
-            "value": overall.value,
-            "low": overall.low,
-            "high": overall.high,
-            "worst": known[worst] if worst else np.nan,
-            "worst_in": worst,
-            "fails_in": "; ".join(fails),
-            "verdict": judged(met and sure and bool(self.meets(ends[0], self.all)), met),
-        }
-
-    def verdict(self, row: Mapping[str, Any], scenes: int) -> Verdict:
-        """Say it."""
-        sign = ">=" if self.least else "<="
-        asked = [f"{self.pool.__name__[3:]} {sign} {self.all:g}"] if self.all is not None else []
-        asked += [f"each {sign} {self.each:g}"] if self.each is not None else []
-        said = f"{row['value']:.3g} [{row['low']:.3g}, {row['high']:.3g}], worst "
-        said += f"{row['worst']:.3g} ({row['worst_in']}); asked: {', '.join(asked) or 'nothing'}"
-        failed = row["fails_in"].split("; ") if row["fails_in"] else []
-        said += f"; fails in {len(failed)} of {scenes}: {', '.join(failed)}" if failed else ""
-        return Verdict(self.claim, row["verdict"], said)
+    def verdict(self, values: pd.DataFrame) -> Verdict:
+        """Judge `values`: say what came out, what was asked and which scenes fail."""
+        sign, word = (1, ">=") if self.least else (-1, "<=")
+        scenes = values.mean(axis=1).dropna().sort_values(ascending=self.least)
+        pooled = mean([float(self.pool(values[seed].dropna())) for seed in values])
+        failed = scenes[sign * scenes < sign * self.each]
+        met = len(scenes) > 0 and not len(failed) and not sign * pooled.value < sign * self.limit
+        end = pooled.low if self.least else pooled.high
+        sure = met and not (sign * values < sign * self.each).any(axis=None)
+        sure = sure and (np.isnan(self.limit) or sign * end >= sign * self.limit)
+        said = f"{self.pool.__name__} of {len(scenes)}: {pooled.text}"
+        said += "".join(f", worst {v:.3g} in {name}" for name, v in scenes[:1].items())
+        limits = {self.pool.__name__: self.limit, "each": self.each}
+        said += "".join(f"; {k} {word} {v:g} asked" for k, v in limits.items() if not np.isnan(v))
+        if len(failed):
+            said += "; fails in " + ", ".join(f"{name} {v:.3g}" for name, v in failed.items())
+        return Verdict(self.claim, judged(sure, met), said)
 
 
+def _gospa(role: str) -> Callable[[Block], Values]:
+    return _at(role, lambda block: _of_empty(block["apart"]["targets"]))
+
+
+_AT, _PT, _OF_EMPTY = "active", "passive", "GOSPA of targets over that of no tracks"
 GOALS = {
-    "at_tracked": Goal(
-        "AT: targets tracked over found", _terminals("active", _of_found), 0.9, least=True
+    "at_tracked": Goal("AT: targets tracked over found", _at(_AT, _of_found), 0.9, least=True),
+    "at_false": Goal(
+        "AT: false tracks a frame", _at(_AT, lambda b: float(b["false_tracks_per_frame"])), 0.2
     ),
-    "at_false": Goal("AT: false tracks a frame", _terminals("active", _false), 0.2),
+    "at_gospa": Goal(f"AT: {_OF_EMPTY}", _gospa(_AT), 1.0, 0.45),
     "pt_tracked": Goal(
-        f"PT: targets tracked over the bound {BOUND}",
-        _terminals("passive", _of_bound),
-        0.5,
-        0.75,
-        True,
-        np.nanmedian,
+        f"PT: targets tracked over {BOUND}", _at(_PT, _of_bound), 0.5, 0.75, True, np.median
     ),
-    "pt_false": Goal("PT: false tracks a frame", _terminals("passive", _false)),
-    "at_gospa": Goal(
-        "AT: GOSPA of targets over that of no tracks",
-        _terminals("active", _targets_of_empty),
-        1.0,
-        0.45,
-    ),
-    "pt_gospa": Goal(
-        "PT: GOSPA of targets over that of no tracks",
-        _terminals("passive", _targets_of_empty),
-        1.0,
-    ),
-    "fused_gospa": Goal("fused tracks: GOSPA over that of no tracks", _fused, 0.6, 0.3),
-    "misread": Goal("data frames read with SER over 0.5", _misread, 0, 0, pool=np.nansum),
-    "switches": Goal("names of UAVs switched in the fused tracks", _switches, all=0.5),
-    "seconds": Goal("processor seconds a frame of reception and tracking", _seconds),
+    "pt_gospa": Goal(f"PT: {_OF_EMPTY}", _gospa(_PT), 1.0),
+    "fused_gospa": Goal(f"fused: {_OF_EMPTY}", _fused(_of_empty), 0.6, 0.3),
+    "misread": Goal("data frames of SER over 0.5 that count as read", _misread, 0, 0, pool=np.sum),
+    "switches": Goal("switched names of UAVs in the fused tracks", _fused(_switches), limit=0.5),
+    "seconds": Goal("processor seconds a frame for reception and tracking", _seconds),
 }
 
 
@@ -240,18 +181,16 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
     """Fly what is missing and judge all of it."""
     kept = kept_folder()
     with tempfile.TemporaryDirectory() if kept is None else nullcontext(str(kept)) as folder:
-        flights = Flights(_files(Path(folder), seed), seeds_wanted(quick), seed, quick)
+        flights = Flights(_places(Path(folder), seed), seeds_wanted(quick), seed, quick)
         fly(flights, Path(folder), progress)
         found = outcomes_of(flights, Path(folder))
-    tables = {name: goal.table(found) for name, goal in GOALS.items()}
-    rows = [goal.row(tables[name]) for name, goal in GOALS.items()]
-    scenes = pd.DataFrame({name: table.mean(axis=1) for name, table in tables.items()})
-    verdicts = [g.verdict(r, len(tables[n])) for (n, g), r in zip(GOALS.items(), rows, strict=True)]
+    values = {name: goal.values(found) for name, goal in GOALS.items()}
+    scenes = pd.DataFrame({name: v.mean(axis=1) for name, v in values.items()})
     return Outcome(
         "flights",
-        "Goals over a folder of scenes",
-        {"goals": pd.DataFrame(rows), "scenes": scenes.rename_axis("scene").reset_index()},
+        "Goals of tracking over a folder of scenes",
+        {"scenes": scenes.rename_axis("scene").reset_index()},
         None,
-        tuple(verdicts),
+        tuple(goal.verdict(values[name]) for name, goal in GOALS.items()),
         {"quick": quick, "seed": seed, "seeds": flights.seeds, "scenes": list(found)},
     )

@@ -30,7 +30,7 @@ CITIES = (*({"source": "builtin", "name": name} for name in _BUILT_IN), None)
 FORMATIONS = ("facing", "beside", "square", "crossing", "abreast", "hovering")
 PT_TURN_DEG = {"facing": (160, 200), "beside": (10, 40), "square": (75, 105)}
 """Angle about the targets from the active to the first passive terminal; else any."""
-ARRAYS = ({}, {"rx_x": 4, "rx_z": 4}, {"rx_x": 12, "rx_z": 6})
+ARRAYS: tuple[dict[str, int], ...] = ({}, {"rx_x": 4, "rx_z": 4}, {"rx_x": 12, "rx_z": 6})
 MOST_SPEED_MPS, HEIGHT_M, DISTANCE_M, SPACING_M = 25.0, (4.0, 30.0), (12.0, 25.0), 3.0
 """Highest speed over ground; heights over it; from the active terminal to the middle of the
 targets; between targets in a row."""
@@ -65,10 +65,11 @@ def drawn(number: int, seed: int) -> dict[str, Any]:
         if site is None:
             continue
         tree["swarm"] = _swarm(formation, site, rng)
-        at, *others = (np.array(uav["position_m"]) for uav in tree["swarm"].values())
-        hidden = [hits(corners, at, place)[0].size > 0 for place in others]
-        targets = [uav["role"] == "target" for uav in tree["swarm"].values()][1:]
-        if np.mean(np.array(hidden)[targets]) > 0.5:
+        at = np.array(tree["swarm"]["AT"]["position_m"])
+        targets = [
+            np.array(u["position_m"]) for u in tree["swarm"].values() if "boresight" not in u
+        ]
+        if np.mean([hits(corners, at, target)[0].size > 0 for target in targets]) > 0.5:
             continue
         try:
             with warnings.catch_warnings():
@@ -93,21 +94,21 @@ def _site(corners: np.ndarray, rng: np.random.Generator) -> Site | None:
 
 
 def _swarm(formation: str, site: Site, rng: np.random.Generator) -> dict[str, Any]:
-    """Draw a swarm: its targets about a site, terminals that look at it about them."""
+    """Draw a swarm: its targets about a site, and terminals about them that look at it."""
     size = int(rng.integers(3, 13))
     passive = 1 if size < 5 else int(rng.integers(1, 3))
     speed = 0.0 if formation == "hovering" else rng.uniform(0, MOST_SPEED_MPS)
     first, second = rng.uniform(*PT_TURN_DEG.get(formation, (0, 360))), rng.uniform(0, 360)
-    out = {}
-    for name, turn in zip(["AT", "PT1", "PT2"][: 1 + passive], (0.0, first, second), strict=False):
-        away = np.append(_along(np.deg2rad(180 + turn)), rng.uniform(-0.1, 0.1))
-        moving = -away * rng.uniform(0, speed / 2)
-        out[name] = _uav(site, rng.uniform(*DISTANCE_M) * away, moving)
-        out[name] |= {"role": "passive" if turn else "active"}
-        out[name]["boresight"] = _rounded(site.turn(-away[None])[0])
     places, flights = _targets(formation, size - 1 - passive, rng)
-    for number, (place, flight) in enumerate(zip(places, speed * flights, strict=True), start=1):
-        out[f"U{number}"] = {"role": "target"} | _uav(site, place, flight)
+    out = {
+        f"U{k}": {"role": "target", **_uav(site, place, speed * flight)}
+        for k, (place, flight) in enumerate(zip(places, flights, strict=True), start=1)
+    }
+    for name, turn in zip(["AT", "PT1", "PT2"][: 1 + passive], (0.0, first, second), strict=False):
+        ahead = np.append(_along(np.deg2rad(turn)), rng.uniform(-0.1, 0.1))
+        moving = ahead * rng.uniform(0, speed / 2)
+        out[name] = {"role": "passive" if turn else "active"}
+        out[name] |= _uav(site, -rng.uniform(*DISTANCE_M) * ahead, moving, ahead)
     return out
 
 
@@ -119,23 +120,18 @@ def _targets(formation: str, count: int, rng: np.random.Generator) -> tuple[np.n
     if formation == "abreast":
         places[:, 0], places[:, 1], heading[:], pace[:] = row, 0, heading[0], 1
     elif formation == "crossing":
-        heading = np.pi * (np.arange(count) % 2 - 0.5)
+        heading[:] = np.pi * (np.arange(count) % 2 - 0.5)
         places[:, 0], places[:, 1] = -5 * np.sin(heading), row
-    flights = pace[:, None] * np.column_stack([_along(heading).T, np.zeros(count)])
-    return places, flights
+    return places, np.column_stack([*(pace * _along(heading)), np.zeros(count)])
 
 
 def _along(heading: Any) -> np.ndarray:
-    """Unit vectors (2, ...) at angles from north to east [rad]."""
+    """Return unit vectors (2, ...) at angles from north to east [rad]."""
     return np.array([np.sin(heading), np.cos(heading)])
 
 
-def _uav(site: Site, place: np.ndarray, velocity: np.ndarray) -> dict[str, Any]:
-    return {
-        "position_m": _rounded(site.place(place[None])[0]),
-        "velocity_mps": _rounded(site.turn(velocity[None])[0]),
-    }
-
-
-def _rounded(vector: np.ndarray) -> list[float]:
-    return [float(v) for v in vector.round(3)]
+def _uav(site: Site, place: np.ndarray, *vectors: np.ndarray) -> dict[str, list[float]]:
+    """Return the place, velocity and boresight of a UAV at a site, rounded for readers."""
+    keys = ("position_m", "velocity_mps", "boresight")
+    values = np.concatenate([site.place(place[None]), site.turn(np.array(vectors))]).round(3)
+    return dict(zip(keys, values.tolist(), strict=False))

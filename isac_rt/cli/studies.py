@@ -86,11 +86,10 @@ def _reproduce(
     check_folder(folder)
     from reproduce import experiment
     from reproduce.city_flights import repeated
-    from reproduce.flights import over
     from reproduce.montecarlo import kept_in
     from reproduce.outcome import write
 
-    with kept_in(folder / "frames"), repeated(seeds), over(scenes):
+    with kept_in(folder / "frames"), repeated(seeds, scenes):
         outcome = with_progress(lambda report: experiment(name)(quick, seed, report), name)
     files = write(outcome, folder)
     colours = {"holds": "green", "holds under a condition": "yellow", "does not hold": "red"}
