@@ -52,8 +52,7 @@ def reproduce(
         int | None, typer.Option(min=1, max=1000, help="Flights at each place, for city, flights.")
     ] = None,
     scenes: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Scenes or their pattern, for flights; else drawn."),
+        Path | None, typer.Option(metavar="DIR", help="Scenes, for flights; by default drawn.")
     ] = None,
 ) -> None:
     """Reproduce tables, figures and claims of the paper and judge them."""
@@ -68,19 +67,14 @@ def reproduce(
     check_names(names, experiments(), "table or figure")
     for option, value, fits in (("seeds", seeds, "city flights"), ("scenes", scenes, "flights")):
         if value is not None and not set(names) <= set(fits.split()):
-            raise InputProblem(
-                f"--{option} goes with {fits.replace(' ', ' or ')} alone; leave it out for other "
-                "experiments"
-            )
+            raise InputProblem(f"--{option} is only for {fits}; leave it out for other experiments")
     for name in dict.fromkeys(names):
         folder = out if out is not None else Path("runs") / "reproduction" / name
         with ending_soon_after_interrupt(folder):
             _reproduce(name, folder, quick, seed, seeds, scenes)
 
 
-def _reproduce(
-    name: str, folder: Path, quick: bool, seed: int, seeds: int | None, scenes: Path | None
-) -> None:
+def _reproduce(name: str, folder: Path, quick: bool, seed: int, *asked: Any) -> None:
     from isac_rt.results.files import check_folder
 
     check_folder(folder)
@@ -89,7 +83,7 @@ def _reproduce(
     from reproduce.montecarlo import kept_in
     from reproduce.outcome import write
 
-    with kept_in(folder / "frames"), repeated(seeds, scenes):
+    with kept_in(folder / "frames"), repeated(*asked):
         outcome = with_progress(lambda report: experiment(name)(quick, seed, report), name)
     files = write(outcome, folder)
     colours = {"holds": "green", "holds under a condition": "yellow", "does not hold": "red"}
