@@ -1,5 +1,6 @@
-"""Parts that a scenario or a command line chooses by name: this package's own, and those that
-installed packages register by an entry point of the group `isac_rt.KIND`.
+"""Parts that are imported by name: those that a scenario or a command line chooses among, this
+package's own and those that installed packages register by an entry point of the group
+`isac_rt.KIND`, and those that the core takes from the extensions.
 
 A part is imported when it is used. Its page in the documentation is *extending*.
 """
@@ -50,8 +51,7 @@ class Registry:
         UserError  If no part has this name, or another package's cannot be imported.
         """
         if name in self.own:
-            module, _, attribute = self.own[name].partition(":")
-            return getattr(import_module(module), attribute)
+            return _imported(self.own[name])
         if (part := self.installed().get(name)) is None:
             raise UserError(f"no {self.kind} {name}; there are {', '.join(self.names())}")
         try:
@@ -77,6 +77,16 @@ class Registry:
             *most, last = self.names()
             raise ValueError(f"must be {', '.join(most)} or {last}")
         return name
+
+
+def _imported(path: str) -> Any:
+    module, _, attribute = path.partition(":")
+    return getattr(import_module(module), attribute)
+
+
+def extension(part: str) -> Any:
+    """Import a part of `EXTENSIONS`."""
+    return _imported(EXTENSIONS[part])
 
 
 DETECTORS = Registry(
@@ -113,44 +123,6 @@ PROPAGATION_MODELS = Registry(
     },
 )
 """Functions of `isac_rt.propagation.build.Ground` that return a `Propagation`."""
-EQUIPMENT = Registry(
-    "equipment", {"city": "isac_rt.extensions.city_receivers.standard:equipment_of"}
-)
-"""Functions of a `Setup`, a `Link` and a set of receivers that return the `Equipment` of the link's
-terminal."""
-MESH_KNOWLEDGE = Registry(
-    "mesh_knowledge",
-    {
-        "walls": "isac_rt.extensions.city_receivers.walls:Walls",
-        "clutter": "isac_rt.extensions.city_receivers.expectation:make_expectation",
-    },
-)
-"""What terminals know of the city's mesh: its walls, and the clutter that they expect."""
-COOPERATIONS = Registry(
-    "cooperations",
-    {name: "isac_rt.extensions.cooperation.swarm:Cooperation" for name in ("tracks", "detections")},
-)
-"""Functions of a `Setup` that return an `isac_rt.simulation.stations.Exchange`."""
-ACCESS = Registry(
-    "access",
-    {
-        "establish": "isac_rt.extensions.access.protocol:establish_links",
-        "feedback": "isac_rt.extensions.access.feedback:exchange",
-    },
-)
-"""Stages before the data and feedback after them."""
-HARDWARE = Registry(
-    "hardware",
-    {
-        "front_end": "isac_rt.extensions.hardware.front_end:front_end_of",
-        "ends": "isac_rt.extensions.hardware.front_end:Ends",
-        "samples": "isac_rt.extensions.hardware.received:received",
-        "noise_left_out": "isac_rt.extensions.hardware.received:noise_left_out",
-        "calibration": "isac_rt.extensions.hardware.calibrate:load_calibration",
-        "calibrated": "isac_rt.extensions.hardware.calibrate:ideal",
-    },
-)
-"""Front ends that are not ideal, their samples, and the calibration of boards."""
 CITY_SOURCES = Registry(
     "city_sources",
     {
@@ -159,14 +131,23 @@ CITY_SOURCES = Registry(
     },
 )
 """Functions of the settings `City` and the scenario's folder that return a `CityParts`."""
-MAP_READERS = Registry(
-    "map_readers",
-    {
-        "files": "isac_rt.extensions.city_files.tables:table_files",
-        "buildings": "isac_rt.extensions.city_files.footprints:footprints",
-        "place": "isac_rt.extensions.city_files.footprints:located",
-    },
-)
-"""Readers of maps: the files that one consists of, its buildings, and where it lies."""
 COMMANDS = Registry("commands", {})
 """Functions with typer's annotations, whose docstring is the help."""
+EXTENSIONS = {
+    "equipment": "isac_rt.extensions.city_receivers.standard:equipment_of",
+    "walls": "isac_rt.extensions.city_receivers.walls:Walls",
+    "expected_clutter": "isac_rt.extensions.city_receivers.expectation:make_expectation",
+    "cooperation": "isac_rt.extensions.cooperation.swarm:Cooperation",
+    "access": "isac_rt.extensions.access.protocol:establish_links",
+    "feedback": "isac_rt.extensions.access.feedback:exchange",
+    "front_end": "isac_rt.extensions.hardware.front_end:front_end_of",
+    "front_ends": "isac_rt.extensions.hardware.front_end:Ends",
+    "hardware_samples": "isac_rt.extensions.hardware.received:received",
+    "hardware_noise_left_out": "isac_rt.extensions.hardware.received:noise_left_out",
+    "calibration": "isac_rt.extensions.hardware.calibrate:load_calibration",
+    "calibrated": "isac_rt.extensions.hardware.calibrate:ideal",
+    "map_files": "isac_rt.extensions.city_files.tables:table_files",
+    "map_buildings": "isac_rt.extensions.city_files.footprints:footprints",
+    "map_place": "isac_rt.extensions.city_files.footprints:located",
+}
+"""Parts that the core takes from its extensions: "module:object" by what it is there."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -148,3 +149,11 @@ def test_names_that_nobody_registered_are_refused():
         registry.PROPAGATION_MODELS._checked("guess")
     with pytest.raises(UserError, match="no propagation_models guess; there are free_space"):
         registry.PROPAGATION_MODELS.load("guess")
+
+
+def test_every_extension_is_there_and_asked_for():
+    """Planted bug: `extensions.access.feedback:exchanged`; a line that nothing asks for."""
+    assert all(callable(registry.extension(part)) for part in registry.EXTENSIONS)
+    sources = "".join(file.read_text() for file in (HERE.parent / "isac_rt").rglob("*.py"))
+    asked_for = re.findall(r'(?:\bextension|_map_reader)\("(\w+)"', sources)
+    assert sorted(asked_for) == sorted(registry.EXTENSIONS)

@@ -33,7 +33,7 @@ from isac_rt.propagation.pathset import PathSet
 from isac_rt.propagation.store import CachedPropagation, PathStore
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
-from isac_rt.registry import ACCESS, HARDWARE, MESH_KNOWLEDGE
+from isac_rt.registry import extension
 from isac_rt.results.provenance import path_content
 from isac_rt.results.records import Use
 from isac_rt.scenario.tree import Scenario
@@ -123,12 +123,12 @@ class Frame:
         link, all_of = Link(*link), self._setup.front_ends
         senders = dict.fromkeys([link.tx, *self.sent])
         each = [all_of[name] for name in senders for _ in self.sent[name].streams()]
-        return HARDWARE.load("ends")(all_of[link.rx], tuple(each))
+        return extension("front_ends")(all_of[link.rx], tuple(each))
 
     def oscillator_noise_left_out(self, link: tuple[str, str]) -> float:
         """Noise within a chirp that `samples` leave out, over the thermal noise."""
         link, power, waveform = Link(*link), self.noise_power(link), self._setup.waveform
-        left_out = HARDWARE.load("noise_left_out")
+        left_out = extension("hardware_noise_left_out")
         return float(left_out(waveform, self._arriving(link), self.ends(link), power))
 
     def samples(self, link: tuple[str, str], ends: Any = None) -> IFCube:
@@ -145,7 +145,7 @@ class Frame:
         if ends is None and not s.has_ideal_hardware:
             ends = self.ends(link)
         if ends is not None and not ends.ideal:
-            make = HARDWARE.load("samples")
+            make = extension("hardware_samples")
             cube: IFCube = make(s.waveform, arriving, *heard, ends, method, noise)
             return cube
         return noisy_if_signal(s.waveform, arriving, *heard, method, noise)
@@ -248,7 +248,7 @@ class Setup:
     @cached_property
     def front_ends(self) -> dict[str, Any]:
         """The hardware of every terminal (`isac_rt.extensions.hardware.front_end.FrontEnd`)."""
-        s, make = self.scenario, HARDWARE.load("front_end")
+        s, make = self.scenario, extension("front_end")
         return {
             name: make(s.front_end_of(name), self.waveform, self.antennas, s.seed, name)
             for name, uav in s.swarm.items()
@@ -266,7 +266,7 @@ class Setup:
         file = self.scenario.calibration_path()
         if file is None:
             return None
-        found = HARDWARE.load("calibration")(file)
+        found = extension("calibration")(file)
         found.check_size(self.antennas.num_rx, self.antennas.num_tx)
         return found
 
@@ -274,14 +274,14 @@ class Setup:
         """Samples without what the calibration says of the board."""
         if self.calibration is None:
             return cube
-        corrected: IFCube = HARDWARE.load("calibrated")(self.calibration, cube)
+        corrected: IFCube = extension("calibrated")(self.calibration, cube)
         return corrected
 
     @cached_property
     def walls(self) -> Any:
         """The city as terminals hold births and tracks against it
         (`isac_rt.extensions.city_receivers.walls.Walls`)."""
-        return MESH_KNOWLEDGE.load("walls")(self.city.without(self.scenario.belief.missing_m))
+        return extension("walls")(self.city.without(self.scenario.belief.missing_m))
 
     def believed(self, pose: Pose) -> Pose:
         """Return the pose that a terminal believes to have."""
@@ -499,7 +499,7 @@ def _expectation_of(
     about = scenario.clutter, plan.swarm, believed, plan.waveform
     own = [link for link in plan.timetable.all_links if link.own]
     floor = _floor_of(scenario, plan, free, own)
-    make = MESH_KNOWLEDGE.load("clutter")
+    make = extension("expected_clutter")
     found: ClutterExpectation = make(*about, plan.antennas, scenario.seed, floor)
     return found
 
@@ -594,7 +594,7 @@ def _connected(setup: Setup) -> Setup:
     if not s.access.establish:
         return replace(setup, connections=Connections(clocks))
 
-    outcome = ACCESS.load("establish")(setup, clocks)
+    outcome = extension("access")(setup, clocks)
     found = Connections(clocks, outcome)
     timetable = replace(timetable, blocks=outcome.blocks, refused=found.refused)
     plan = replace(setup.plan, timetable=timetable)

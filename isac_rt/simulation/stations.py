@@ -10,16 +10,15 @@ from typing import Any, Protocol
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
 from isac_rt.receive.settings import Receivers
-from isac_rt.registry import ACCESS, COOPERATIONS, EQUIPMENT
+from isac_rt.registry import extension
 from isac_rt.results.metrics import SymbolCount
 from isac_rt.results.recorder import Recorder
 from isac_rt.results.records import FrameRecord, LateRecord, ObserverRecord, PictureRecord
 from isac_rt.results.scoring import Heard, Scorer
 from isac_rt.results.swarm import SwarmScorer, View
 from isac_rt.scenario.presets import ReceiverSet
-from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import Frame, Setup
-from isac_rt.track.parts import Equipment, KnownBody, Late
+from isac_rt.track.parts import KnownBody, Late
 from isac_rt.track.reference import TerminalState
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal, Receiver
 from isac_rt.world.swarm import Pose, Swarm
@@ -41,24 +40,12 @@ def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = N
     ['ActiveTerminal', 'PassiveTerminal', 'PassiveTerminal']
     """
     s = settings or setup.scenario
-    equipment = EQUIPMENT.load("city")(setup, link, s) if _knows_city(s) else Equipment()
+    equipment = extension("equipment")(setup, link, s)
     known = setup.waveform, setup.antennas, s.receivers, s.tracking
     if link.own:
         return ActiveTerminal(*known, equipment)
     order, groups = setup.scenario.modulation.dpsk_order, setup.timetable.groups(link)
     return PassiveTerminal(*known, order, setup.plan.amplitude, groups, equipment)
-
-
-def _knows_city(s: ReceiverSet | Scenario) -> bool:
-    """Return whether terminals have more than a receiver and a tracker."""
-    r = s.receivers
-    return (
-        s.tracking.births == "unexplained"
-        or r.link_acquisition == "blind"
-        or r.self_calibration != "none"
-        or r.passive_detector == "beams"
-        or r.gate_false_alarm_rate is not None
-    )
 
 
 def terminal_with(setup: Setup, link: Link, made: Terminal | Receiver) -> Terminal:
@@ -150,7 +137,7 @@ class Station:
         if not isinstance(self.terminal, PassiveTerminal):
             return
         s, when = self.setup, self.setup.timetable.epoch(frame, self.link.tx)
-        answer = ACCESS.load("feedback")(
+        answer = extension("feedback")(
             heard.reception,
             heard.tracks,
             at_active.tracks,
@@ -233,7 +220,7 @@ class StationSet:
             {link: Station(setup, link, terminal(link), receivers) for link in timetable.all_links},
             Recorder(timetable, [state.name.lower() for state in TerminalState]),
             setup.swarm,
-            None if cooperation == "none" else COOPERATIONS.load(cooperation)(setup),
+            None if cooperation == "none" else extension("cooperation")(setup),
             SwarmScorer(timetable),
         )
 

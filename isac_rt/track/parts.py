@@ -1,7 +1,7 @@
 """Optional parts of a terminal besides its receiver and its tracker: rules for its tracks, a model
 of its own hardware, and reading over other paths. Without any of them it detects and tracks.
 
-The classes here do nothing; those that do are handed in (`isac_rt.registry.EQUIPMENT`).
+The classes here do nothing; those that do are handed in (`isac_rt.registry.EXTENSIONS`).
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from isac_rt.registry import CITY_SOURCES, MAP_READERS
+from isac_rt.registry import CITY_SOURCES, extension
 from isac_rt.world import settings
 from isac_rt.world.city.files import missing_extra, needs_extra
 from isac_rt.world.city.materials import CityError, resolve_materials
@@ -67,7 +67,7 @@ def city_files(city: settings.City | None, folder: Path) -> list[Path]:
     path = _path(city, folder)
     if city.source == "footprints":
         terrain = _terrain(city, folder)
-        return [*_map_reader("files", path)(path), *([] if terrain is None else [terrain])]
+        return [*_map_reader("map_files", path)(path), *([] if terrain is None else [terrain])]
     return mesh_files(path) if city.source == "mesh" else mitsuba_files(path)
 
 
@@ -100,7 +100,7 @@ def _map_reader(part: str, path: Path) -> Any:
     """
     needs_extra("pyproj", path.name, "maps")
     try:
-        return MAP_READERS.load(part)
+        return extension(part)
     except ImportError:
         raise missing_extra(path.name, "maps") from None
 
@@ -122,7 +122,7 @@ def blocks(city: settings.City, folder: Path) -> CityParts:
 def footprints(city: settings.City, folder: Path) -> CityParts:
     """Buildings extruded from footprints or read as solids, on their terrain."""
     path = _path(city, folder)
-    found = _map_reader("buildings", path)(city, path, _terrain(city, folder))
+    found = _map_reader("map_buildings", path)(city, path, _terrain(city, folder))
     return CityParts(city.name or path.name, *found)
 
 
@@ -153,7 +153,7 @@ def city_place(city: settings.City, folder: Path) -> Place | None:
     if city.source != "footprints":
         return None
     path = _path(city, folder)
-    place: Place = _map_reader("place", path)(city, path, [], [])[1]
+    place: Place = _map_reader("map_place", path)(city, path, [], [])[1]
     return place
 
 
