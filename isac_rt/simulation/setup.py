@@ -583,20 +583,18 @@ def plan_of(scenario: Scenario, antennas: Antennas, timetable: Timetable, swarm:
 def _connected(setup: Setup) -> Setup:
     """The same after the stages before the data, where the scenario has them; the last of their
     frames ends by the first of the run's."""
-    s, timetable = setup.scenario, setup.timetable
-    active, passive = (
-        [n for n, u in s.swarm.items() if u.role == r] for r in ("active", "passive")
-    )
+    s = setup.scenario
     clocks = {
-        name: Clock(s.swarm[name].clock_offset_s, s.swarm[name].clock_drift_ppm * 1e-6)
-        for name in (active + passive if s.access.synchronisation != "external" else [])
+        name: Clock(uav.clock_offset_s, uav.clock_drift_ppm * 1e-6)
+        for name, uav in s.swarm.items()
+        if uav.role != "target" and s.access.synchronisation != "external"
     }
     if not s.access.establish:
         return replace(setup, connections=Connections(clocks))
 
     outcome = extension("access")(setup, clocks)
     found = Connections(clocks, outcome)
-    timetable = replace(timetable, blocks=outcome.blocks, refused=found.refused)
+    timetable = replace(setup.timetable, blocks=outcome.blocks, refused=found.refused)
     plan = replace(setup.plan, timetable=timetable)
     return replace(setup, timetable=timetable, connections=found, plan=plan)
 
