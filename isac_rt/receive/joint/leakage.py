@@ -72,26 +72,31 @@ def _powers(x: np.ndarray) -> np.ndarray:
     return out
 
 
-def _tones(known: Known, delay: float, group: int) -> tuple[np.ndarray, np.ndarray]:
-    """(P, N) the signal of a path of some delay at rest in the chirps of a group, and x."""
+def _tones(known: Known, delay: float, group: int) -> np.ndarray:
+    """(P, N) the signal of a path of some delay at rest in the chirps of a group."""
     w = known.waveform
-    data = known.delay_symbols[group][:, None] * w.delay_step
-    cycles = w.phase(data + delay, w.fast_time)
-    tone = known.phases[group][:, None] * np.exp(2j * np.pi * (cycles % 1))
-    return tone, (w.fast_time - data) / w.sampled_duration - _middle(known)
+    cycles = w.phase(_data_delays(known, group) + delay, w.fast_time)
+    return np.asarray(known.phases[group][:, None] * np.exp(2j * np.pi * (cycles % 1)))
 
 
-def _middle(known: Known) -> float:
+def _times(known: Known, group: int) -> np.ndarray:
+    """(P, N) x of the samples of a group."""
     w = known.waveform
-    return float(w.fast_time.mean() / w.sampled_duration)
+    middle = float(w.fast_time.mean() / w.sampled_duration)
+    return (w.fast_time - _data_delays(known, group)) / w.sampled_duration - middle
+
+
+def _data_delays(known: Known, group: int) -> np.ndarray:
+    """(P, 1) delays that carry the data of a group's chirps [s]."""
+    return known.delay_symbols[group][:, None] * known.waveform.delay_step
 
 
 def _sums(samples: np.ndarray, known: Known, delay: float, shapes: Shapes) -> np.ndarray:
     """(L_tx, L_rx, Q) sums of s T* g* over the samples of each pair, for the factors g."""
     out: np.ndarray | float = 0.0
     for group, (mine, schedule) in enumerate(zip(samples, known.schedule, strict=True)):
-        tone, x = _tones(known, delay, group)
-        design = (tone[:, None] * shapes(x)).conj().astype(np.complex64)
+        factors = shapes(_times(known, group))
+        design = (_tones(known, delay, group)[:, None] * factors).conj().astype(np.complex64)
         each = mine.swapaxes(0, 1) @ design.swapaxes(1, 2)  # chirp, receiver, factor
         sent = schedule == np.arange(known.antennas.num_tx)[:, None]
         out = out + np.einsum("ap,prq->arq", sent, each.astype(complex))
@@ -100,7 +105,7 @@ def _sums(samples: np.ndarray, known: Known, delay: float, shapes: Shapes) -> np
 
 def _fit(known: Known, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(L_tx, L_rx) amplitude and phi of every pair, by Gauss-Newton from phi = 0."""
-    x = [_tones(known, 0.0, group)[1] for group in range(len(known.schedule))]
+    x = [_times(known, group) for group in range(len(known.schedule))]
     own = [
         np.concatenate([a[s == tx] for a, s in zip(x, known.schedule, strict=True)])
         for tx in range(known.antennas.num_tx)
@@ -131,8 +136,8 @@ def _taken_out(
     out = np.empty_like(samples)
     weights = amplitude[..., None] * _series(phi)
     for group, schedule in enumerate(known.schedule):
-        tone, x = _tones(known, delay, group)
-        design = (tone[:, None] * _powers(x)).astype(np.complex64)
+        factors = _powers(_times(known, group))
+        design = (_tones(known, delay, group)[:, None] * factors).astype(np.complex64)
         model = weights[schedule].astype(np.complex64) @ design
         np.subtract(samples[group], model.swapaxes(0, 1), out=out[group])
     return out
