@@ -131,7 +131,7 @@ def make_plan(setup: Setup) -> dict[str, Any]:
     for link, of_link in uses.items():
         items += _link_items(setup, link, of_link)
     items += _standing_items(setup, light, late, short_lived / len(frames))
-    items += [] if all(e.ideal for e in setup.front_ends.values()) else _hardware_items(last)
+    items += [] if setup.has_ideal_hardware else _hardware_items(last)
     items += _self_calibration_items(setup, last)
     return {
         **mechanisms(setup.scenario.propagation, setup.scenario.clutter),
