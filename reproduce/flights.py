@@ -133,8 +133,14 @@ class Goal:
     def values(self, found: Mapping[str, Any]) -> pd.DataFrame:
         """Return the values by scene and terminal (rows) and seed (columns)."""
         flown = {scene: [self.measure(o) for o in outcomes] for scene, outcomes in found.items()}
-        rows = {f"{s} {n}".strip(): [v[n] for v in vs] for s, vs in flown.items() for n in vs[0]}
-        return pd.DataFrame.from_dict(rows, orient="index")
+        rows = {(s, n): [v[n] for v in vs] for s, vs in flown.items() for n in vs[0]}
+        index = pd.MultiIndex.from_tuples(rows, names=["scene", "of"])
+        return pd.DataFrame([*rows.values()], index)
+
+    def worst(self, values: pd.DataFrame) -> pd.Series:
+        """Return the worst of `values` in each scene, means over seeds."""
+        by_scene = values.mean(axis=1).groupby(level=0, sort=False)
+        return by_scene.min() if self.least else by_scene.max()
 
     def verdict(self, values: pd.DataFrame) -> Verdict:
         """Judge `values`: say what came out, what was asked and which scenes fail."""
@@ -147,11 +153,11 @@ class Goal:
         sure = met and not (sign * values < sign * self.each).any(axis=None)
         sure = sure and (np.isnan(self.limit) or sign * end >= sign * self.limit)
         said = f"{self.pool.__name__} of {len(scenes)}: {pooled.text}"
-        said += "".join(f", worst {v:.3g} in {name}" for name, v in scenes[:1].items())
+        said += "".join(f", worst {v:.3g} in {' '.join(at)}" for at, v in scenes[:1].items())
         limits = {self.pool.__name__: self.limit, "each": self.each}
         said += "".join(f"; {k} {word} {v:g} asked" for k, v in limits.items() if not np.isnan(v))
         if len(failed):
-            said += "; fails in " + ", ".join(f"{name} {v:.3g}" for name, v in failed.items())
+            said += "; fails in " + ", ".join(f"{' '.join(k)} {v:.3g}" for k, v in failed.items())
         return Verdict(self.claim, judged(sure, met), said)
 
 
@@ -185,12 +191,13 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         fly(flights, Path(folder), progress)
         found = outcomes_of(flights, Path(folder))
     values = {name: goal.values(found) for name, goal in GOALS.items()}
-    scenes = pd.DataFrame({name: v.mean(axis=1) for name, v in values.items()})
+    values = {name: v for name, v in values.items() if len(v)}  # what the scenes can show
+    scenes = pd.DataFrame({name: GOALS[name].worst(v) for name, v in values.items()})
     return Outcome(
         "flights",
         "Goals of tracking over a folder of scenes",
-        {"scenes": scenes.rename_axis("scene").reset_index()},
+        {"scenes": scenes.reset_index()},
         None,
-        tuple(goal.verdict(values[name]) for name, goal in GOALS.items()),
+        tuple(GOALS[name].verdict(v) for name, v in values.items()),
         {"quick": quick, "seed": seed, "seeds": flights.seeds, "scenes": list(found)},
     )

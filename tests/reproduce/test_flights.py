@@ -45,9 +45,12 @@ def test_goals_by_hand():
     assert verdict.finding.startswith(f"mean of 2: 0.775 [{0.775 - half:.3g}, {0.775 + half:.3g}]")
     assert "worst 0.6 in b AT" in verdict.finding and "fails in b AT 0.6" in verdict.finding
     assert verdict.verdict == "does not hold"
+    assert goal.worst(goal.values(found)).to_dict() == pytest.approx({"a": 0.95, "b": 0.6})
     passive = GOALS["pt_tracked"]
-    assert passive.values(found).loc["a PT"].tolist() == [0.9, 1.0]
+    assert passive.values(found).loc["a", "PT"].tolist() == [0.9, 1.0]
     assert passive.verdict(passive.values(found)).finding.startswith("median of 1: 0.95")
+    alone = {"a": [{"terminals": {"AT": block("active", 0.5, 18)}, "swarm": None}]}
+    assert not any(len(GOALS[name].values(alone)) for name in ("pt_gospa", "fused_gospa"))
     assert (GOALS["pt_gospa"].values(found) == 0.25).all(axis=None)
 
 
@@ -62,8 +65,9 @@ def test_goals_by_hand():
     ],
 )
 def test_a_goal_asks_each_flight_and_all(values, verdict):
-    goal = Goal("x", lambda o: {}, 0.3, 0.25)
-    assert goal.verdict(pd.DataFrame(values)).verdict == verdict
+    goal = Goal("x", lambda o: o, 0.3, 0.25)
+    rows = [[{"AT": v} for v in row] for row in values]
+    assert goal.verdict(goal.values(dict(zip("ab", rows, strict=False)))).verdict == verdict
 
 
 def test_misread_frames_by_hand():
@@ -101,7 +105,7 @@ def test_a_folder_of_scenes_is_flown_once(tmp_path, monkeypatch, capsys):
     about = json.loads((out / "flights.json").read_text())
     assert about["settings"]["scenes"] == ["one"] and len(about["verdicts"]) == len(GOALS)
     scenes = pd.read_csv(out / "flights.csv").set_index("scene")
-    assert scenes.loc["one"].seconds > 0 and "one AT->PT1" in scenes.index
+    assert scenes.loc["one"].seconds > 0 and scenes.loc["one"].misread == 0
     assert main([*command, "--scenes", str(tmp_path / "none")]) == 2
     assert main(["reproduce", "city", "--scenes", str(tmp_path)]) == 2
     assert "--scenes" in capsys.readouterr().err
