@@ -31,7 +31,7 @@ from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import generator
-from isac_rt.receive.cfar import CfarRule
+from isac_rt.receive.cfar import CfarRule, first_row
 from isac_rt.receive.clutter_filter import RUN_CELLS, remove_standing
 from isac_rt.receive.estimate import Estimate, LocalSpectra, refine, start_point, to_delay
 from isac_rt.receive.known import Known
@@ -238,11 +238,6 @@ def is_detected(power: np.ndarray, row: int, column: int, looks: int) -> bool:
     return bool(CfarRule.of(SETTINGS, looks).detect(power)[0][row, column])
 
 
-def first_row(case: Setting, cell: float) -> int:
-    """Rows before it are not searched."""
-    return int(np.ceil(SETTINGS.min_range_m / cell))
-
-
 def _fmcw(
     case: Setting, target: Target, rng: np.random.Generator, noise: MakeNoise, note: Note
 ) -> None:
@@ -252,7 +247,7 @@ def _fmcw(
         fmcw_spectra(samples[0])
         for samples in (make_cube(case, target, schedule, payload).samples, noise())
     ]
-    first = first_row(case, w.range_cell(2))
+    first = first_row(SETTINGS, w.range_cell(2))
     _tdm(
         case,
         target,
@@ -283,7 +278,7 @@ def _loradar(
             both,
             (sent.schedule, times),
             partial(loradar_delay, system),
-            first_row(case, system.range_cell),
+            first_row(SETTINGS, system.range_cell),
             kind,
             note,
         )
@@ -381,7 +376,7 @@ class _Look:
         """Whether the estimate at a map's strongest cell hits, and the cell."""
         w = self.case.waveform
         row, column = strongest(
-            power, first_row(self.case, w.range_cell(self.case.passes)), self.near
+            power, first_row(SETTINGS, w.range_cell(self.case.passes)), self.near
         )
         local = LocalSpectra(self.spectra, self.known, row)
         estimate = refine(local, *start_point(power, row, column, w))

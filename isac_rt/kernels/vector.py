@@ -219,39 +219,6 @@ def backwards(typingctx, value):
 
 
 @intrinsic
-def swap_pairs(typingctx, value):
-    """Lanes 1 0 3 2 ...: real and imaginary parts change places."""
-
-    def codegen(context, builder, signature, args):
-        nothing = ir.Constant(signature.return_type.form, ir.Undefined)
-        return builder.shuffle_vector(args[0], nothing, _mask(i ^ 1 for i in range(LANES)))
-
-    return value(value), codegen
-
-
-@intrinsic
-def even_twice(typingctx, value):
-    """Lanes 0 0 2 2 ...: real parts, for both parts of a product."""
-
-    def codegen(context, builder, signature, args):
-        nothing = ir.Constant(signature.return_type.form, ir.Undefined)
-        return builder.shuffle_vector(args[0], nothing, _mask(i & ~1 for i in range(LANES)))
-
-    return value(value), codegen
-
-
-@intrinsic
-def odd_twice(typingctx, value):
-    """Lanes 1 1 3 3 ...: imaginary parts."""
-
-    def codegen(context, builder, signature, args):
-        nothing = ir.Constant(signature.return_type.form, ir.Undefined)
-        return builder.shuffle_vector(args[0], nothing, _mask(i | 1 for i in range(LANES)))
-
-    return value(value), codegen
-
-
-@intrinsic
 def _all(typingctx, value, like):
     """The same number in all lanes of a vector like another."""
 

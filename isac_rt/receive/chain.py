@@ -47,11 +47,6 @@ def filter_of(settings: Receivers) -> ClutterFilter | None:
     return FILTERS[settings.clutter_filter](settings)
 
 
-def cfar_of(settings: Receivers) -> Cfar:
-    """The CFAR that the settings name."""
-    return cfar_with(settings, ESTIMATORS[settings.refinement])
-
-
 def cfar_with(settings: Receivers, estimator: Estimator) -> Cfar:
     """The CFAR that the settings name, with an estimator of its peaks."""
     return CFARS[settings.velocity_method](settings, estimator)

@@ -24,7 +24,7 @@ from isac_rt.receive.cfar import (
     peaks,
     without_sidelobes,
 )
-from isac_rt.receive.chain import cfar_of
+from isac_rt.receive.chain import passive_detector_of
 from isac_rt.receive.estimate import (
     STENCILS,
     LocalSpectra,
@@ -164,7 +164,7 @@ def test_method_follows_the_schedule():
 
     def way(method: str, w: Waveform, slots: np.ndarray) -> type:
         sent = Known.unmodulated(w, slots, ANTENNAS, 2)
-        return type(cfar_of(Receivers(velocity_method=method)).way(sent))
+        return type(passive_detector_of(Receivers(velocity_method=method)).way(sent))
 
     assert way("auto", Waveform(), schedule) is LatinUnion
     assert way("auto", two, schedule[:2]) is Omp

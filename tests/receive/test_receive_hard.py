@@ -15,7 +15,7 @@ from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.active import receive_active
-from isac_rt.receive.chain import cfar_of
+from isac_rt.receive.chain import passive_detector_of
 from isac_rt.receive.maps import own_bins
 from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.settings import Receivers
@@ -51,7 +51,10 @@ def bounds(trials: int, rate: float) -> tuple[float, float]:
 
 def above(signal: IFCube, payload, settings: Receivers) -> np.ndarray:
     """Cells of the map above the threshold."""
-    detector, sent = cfar_of(settings), known(signal.waveform, signal.schedule, payload, FEW, 1)
+    detector, sent = (
+        passive_detector_of(settings),
+        known(signal.waveform, signal.schedule, payload, FEW, 1),
+    )
     power = detector.way(sent).power(clean_spectrum(signal, sent), sent)
     return detector.rule(sent).detect(power)[0]
 

@@ -14,7 +14,7 @@ from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive import pursuit
 from isac_rt.receive.active import receive_active
-from isac_rt.receive.chain import cfar_of
+from isac_rt.receive.chain import passive_detector_of
 from isac_rt.receive.estimate import Estimate, LocalSpectra
 from isac_rt.receive.pursuit import Pursuit, _add, _Path, _take_out
 from isac_rt.receive.sense import describe
@@ -167,7 +167,7 @@ def test_alarms_in_noise_come_at_the_rate_of_the_design(groups: int):
         signal = cube(w, schedule, payload, [], three, noise=1.0, seed=seed)
         chirps = known(w, schedule, payload, three, 1)
         spectra = clean_spectrum(signal, chirps)
-        alarms += len(cfar_of(settings).sense(spectra, chirps).detections)
+        alarms += len(passive_detector_of(settings).sense(spectra, chirps).detections)
     assert 147.456 / 1.5 < alarms < 147.456 * 1.5
 
 

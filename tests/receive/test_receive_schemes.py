@@ -13,7 +13,7 @@ from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import conventional_schedule, pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.active import receive_active
-from isac_rt.receive.chain import cfar_of
+from isac_rt.receive.chain import passive_detector_of
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import Conventional, LatinUnion, conventional_power, own_bins
 from isac_rt.receive.omp import Omp, recovery_limit
@@ -72,7 +72,7 @@ def test_method_follows_the_schedule():
 def way(settings: Receivers, schedule: np.ndarray) -> type:
     """How the map of a frame with this schedule is made."""
     w = Waveform(num_groups=len(schedule))
-    return type(cfar_of(settings).way(Known.unmodulated(w, schedule, FEW, 2)))
+    return type(passive_detector_of(settings).way(Known.unmodulated(w, schedule, FEW, 2)))
 
 
 def test_conventional_map_is_each_antennas_own_transform():

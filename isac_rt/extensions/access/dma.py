@@ -44,14 +44,12 @@ class Isolation:
     Attributes
     ----------
     spacing : blocks by which the neighbour's chirps start later than the reference
-    timing_error : by which they are late besides [s]
     power_db : power over the window, same block and no error over this neighbour
     peak_db : the strongest cell of its Hann-windowed range spectra against that of the same chirps
         in the same block
     """
 
     spacing: int
-    timing_error: float
     power_db: float
     peak_db: float
 
@@ -174,7 +172,6 @@ def isolation(
     other = mix(w, moved[None], amplitude, oversampling=oversampling)
     return Isolation(
         spacing=spacing,
-        timing_error=timing_error,
         power_db=_ratio_db(_power(own), _power(other)),
         peak_db=_ratio_db(_peak(own), _peak(other)),
     )

@@ -46,7 +46,7 @@ SEEN_LOWERED_M = 0.5
 def _model(city: settings.City, path: Path, notes: list[str]) -> CityModel:
     """Return the content of a file, in its own coordinates."""
     if path.suffix.lower() in TABLES:
-        features, crs = read_table(path, city.layer, notes)
+        features, crs = read_table(path, city.layer)
         return CityModel(crs, buildings(features, city, path.name, notes))
     data = unpacked(read_bytes(path, JSON_FACTOR), path.name, JSON_FACTOR)
     data = data.removeprefix(b"\xef\xbb\xbf")

@@ -64,7 +64,7 @@ def table_files(path: Path) -> list[Path]:
     return [path, *(file for file in found if file.is_file())]
 
 
-def read_table(path: Path, layer: str | None, notes: list[str]) -> tuple[list[Feature], str]:
+def read_table(path: Path, layer: str | None) -> tuple[list[Feature], str]:
     """The rows of a table as features of a map, and its coordinate reference system.
 
     Raises

@@ -89,10 +89,6 @@ class Asked(Exception):
     """What the city shows was asked for."""
 
 
-def _raise(what):
-    raise what
-
-
 @pytest.mark.parametrize("read", [False, True])
 def test_the_city_is_expected_from_where_the_data_say(read):
     """Once a data frame was read its word counts, and before it the track, 1 m off and 1.2 m/s.
