@@ -12,7 +12,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 from scipy import stats
 
-from isac_rt.extensions.access.dma import isolation
 from isac_rt.extensions.access.feedback import correct, frames_to_repair, summarise
 from isac_rt.extensions.access.protocol import Network, establish
 from isac_rt.frame.clock import Clock
@@ -31,6 +30,7 @@ from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Direct
 from isac_rt.world.swarm import Pose
 from reproduce import onepath
+from reproduce.dma import isolation
 from reproduce.outcome import Progress, Sentences, Verdict, proportion, table
 from reproduce.waves import STILL, prediction, sender, waves
 

@@ -5,7 +5,7 @@ Resource blocks start 2 T_d apart, so that a neighbour of `spacing` blocks beats
 and up to f_s above that, and the IF filter of [0, f_s] keeps it out. `ifsignal` has the filter as a
 gain on every chirp's beat, which is exact for tones that last. Here the oscillators themselves are
 multiplied: chirps begin and end inside the window, the filter rings, and what is left of a
-neighbour in the band is what its edges leave. `test_access_dma.py` asserts the
+neighbour in the band is what its edges leave. `tests/reproduce/test_dma.py` asserts the
 following, for the paper's numbers with a skirt of 0.4 MHz and data on every chirp:
 
 - the neighbours' power over the window is at least 47 dB down at 1, 53 dB at 2 and 56 dB at 3

@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.extensions.access.dma import isolation, mix, raised_cosine
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import random_payload, unmodulated
@@ -20,6 +19,7 @@ from isac_rt.signal.exact import filter_gain
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Direct, Exact
 from isac_rt.world.swarm import Pose
+from reproduce.dma import isolation, mix, raised_cosine
 
 C = SPEED_OF_LIGHT
 W = Waveform()
