@@ -64,13 +64,16 @@ def _ratio(part: float | None, whole: float | None) -> float:
 
 
 def _of_found(block: Block) -> float:
+    """Return the share of the targets found that are tracked; at most 1, for tracks bridge gaps."""
     targets = block["apart"]["targets"]
-    return _ratio(targets["tracked"], (targets["hit_rate"] or 0) * targets["in_view"])
+    found = round((targets["hit_rate"] or 0) * targets["in_view"])
+    return min(_ratio(targets["tracked"], found), 1.0)
 
 
 def _of_bound(block: Block) -> float:
+    """Return the share of the targets that are detectable and tracked, at most 1."""
     targets = block["apart"]["targets"]
-    return _ratio(targets["tracked"], (targets["bounds"][BOUND] or 0) * targets["in_view"])
+    return min(_ratio(targets["tracked"], (targets["bounds"][BOUND] or 0) * targets["in_view"]), 1)
 
 
 def _of_empty(block: Block) -> float:
@@ -153,11 +156,15 @@ class Goal:
         sure = met and not (sign * values < sign * self.each).any(axis=None)
         sure = sure and (np.isnan(self.limit) or sign * end >= sign * self.limit)
         said = f"{self.pool.__name__} of {len(scenes)}: {pooled.text}"
-        said += "".join(f", worst {v:.3g} in {' '.join(at)}" for at, v in scenes[:1].items())
+        said += "".join(
+            f", worst {v:.3g} in {' '.join(at).strip()}" for at, v in scenes[:1].items()
+        )
         limits = {self.pool.__name__: self.limit, "each": self.each}
         said += "".join(f"; {k} {word} {v:g} asked" for k, v in limits.items() if not np.isnan(v))
         if len(failed):
-            said += "; fails in " + ", ".join(f"{' '.join(k)} {v:.3g}" for k, v in failed.items())
+            said += "; fails in " + ", ".join(
+                f"{' '.join(k).strip()} {v:.3g}" for k, v in failed.items()
+            )
         return Verdict(self.claim, judged(sure, met), said)
 
 

@@ -23,7 +23,8 @@ from isac_rt.sweep.drawn import MOST_TRIES
 from isac_rt.world.passage import hits
 from reproduce import SCENES
 
-FRAMES = 15
+FRAMES = 20
+"""As many that 0.9 of a target's frames leave two for starting its track."""
 _BUILT_IN = "munich", "florence", "etoile", "san_francisco", "simple_street_canyon_with_cars"
 CITIES = (*({"source": "builtin", "name": name} for name in _BUILT_IN), None)
 """Nodes `city`; None: the blocks of the base scene."""
