@@ -25,7 +25,7 @@ from benchmarks.scenes import alone
 from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.propagation.ways import LinkState
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Gridded

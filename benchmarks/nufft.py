@@ -46,17 +46,20 @@ def by_finufft(waveform: Waveform, tones: Tones) -> np.ndarray:
         late = t.symbol_delay[t.link, source, p] + (source - m) * w.group_spacing
         whole = t.delay + (t.rate + t.accel * time / 2) * time + late
         strength = t.factor * t.send[t.link, source, p] * filter_gain(w, w.slope * whole)
-        heard = np.flatnonzero(strength)
-        if not heard.size:
+        loud = np.flatnonzero(strength)
+        if not loud.size:
             continue
-        antenna = t.antenna[t.link[heard], source, p]
-        delay, rate = whole[heard] + t.tx_delay[heard, antenna], (t.rate + t.accel * time)[heard]
+        antenna = t.antenna[t.link[loud], source, p]
+        delay, rate = (
+            whole[loud] + t.tx_delay[loud, antenna],
+            (t.rate + t.accel * time)[loud],
+        )
         carrier, beat = w.carrier(delay, middle), w.slope * delay
         frequency = (carrier * rate + beat) * step % 1.0
-        bend = carrier * t.accel[heard] / 2 + w.slope * rate * (1 - rate / 2)
+        bend = carrier * t.accel[loud] / 2 + w.slope * rate * (1 - rate / 2)
         bow = 2 * np.pi * bend * (step * half) ** 2
-        turned = strength[heard] * np.exp(2j * np.pi * w.phase(delay, middle) + 1j * bow * centre)
-        one = turned * steer[:, heard]
+        turned = strength[loud] * np.exp(2j * np.pi * w.phase(delay, middle) + 1j * bow * centre)
+        one = turned * steer[:, loud]
         sums = finufft.nufft1d1(
             (2 * np.pi * frequency).astype(np.float32),
             np.ascontiguousarray(np.concatenate([one, 1j * bow * one]), np.complex64),

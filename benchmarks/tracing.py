@@ -1,8 +1,8 @@
 """Paths of a frame: by Sionna's own solver, and by images over the chains that rays found.
 
 Error: ||g - g_full|| / ||g_full|| over the complex gains of all paths, those that only one of the
-two found included, the largest of the frames. The search itself is once a knot and not in the time.
-"""
+two found included, the largest of the frames. The search itself is once a time sample and not in
+the time."""
 
 from __future__ import annotations
 

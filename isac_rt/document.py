@@ -328,14 +328,14 @@ class Document:
         except yaml.YAMLError as error:
             said = _yaml_complaint(error, written)[1]
             raise ScenarioError(f"{option}: the value cannot be read: {said}") from None
-        here, key = self._way(parts, option)
+        here, key = self._locate(parts, option)
         here[key[-1]] = value
         for old in [place for place in self.places if place[: len(key)] == key]:
             del self.places[old]
         self.places |= {(*key, *place[len(key) :]): option for place in reader.places}
         self.places[key] = option
 
-    def _way(self, parts: list[str], option: str) -> tuple[Any, Key]:
+    def _locate(self, parts: list[str], option: str) -> tuple[Any, Key]:
         """The mapping or list that the last of the parts is in, and the key; mappings on the way
         are made."""
         here: Any = self.data

@@ -231,7 +231,7 @@ def check_unfolded(opened: Any, file_bytes: int, most: float, refuse_links: bool
 
     total = 0
 
-    def look(group: Any, depth: int) -> None:
+    def visit(group: Any, depth: int) -> None:
         nonlocal total
         for name in group:
             if not isinstance(group.get(name, getlink=True), h5py.HardLink):
@@ -240,7 +240,7 @@ def check_unfolded(opened: Any, file_bytes: int, most: float, refuse_links: bool
                 continue
             node = group[name]
             if isinstance(node, h5py.Group) and depth < MAX_HDF5_DEPTH:
-                look(node, depth + 1)
+                visit(node, depth + 1)
             if not isinstance(node, h5py.Dataset) or node.shape is None:
                 continue
             if node.is_virtual or node.external:
@@ -255,7 +255,7 @@ def check_unfolded(opened: Any, file_bytes: int, most: float, refuse_links: bool
             if total > min(most, HDF5_PACKING * file_bytes + MAX_HDF5_PIECE):
                 raise ValueError(f"{file_bytes} bytes unfold to more than {total:.3g}")
 
-    look(opened, 0)
+    visit(opened, 0)
 
 
 def save_data(file: Path, key: str, value: Any) -> None:

@@ -40,10 +40,10 @@ paths
 # form the ridge.
 
 # %%
-heard = paths["AT", "PT1"]
+received = paths["AT", "PT1"]
 figure, ax = plt.subplots(figsize=(8, 4))
 for kind in irt.PathKind:
-    one = heard.select(heard.kind == kind)
+    one = received.select(received.kind == kind)
     if len(one):
         size = 4 if len(one) > 100 else 40
         ax.scatter(
@@ -62,8 +62,8 @@ ax.legend()
 # %%
 later = irt.trace(scenario, 1, setup=setup)["AT", "PT1"]
 dt = setup.timetable.epoch(1) - epoch
-rate, accel = heard.delay_rate[0], heard.delay_accel[0]
+rate, accel = received.delay_rate[0], received.delay_accel[0]
 print(
-    f"moved {1e12 * (later.delay[0] - heard.delay[0]):.4f} ps, foretold "
+    f"moved {1e12 * (later.delay[0] - received.delay[0]):.4f} ps, foretold "
     f"{1e12 * (rate * dt + accel * dt**2 / 2):.4f} ps"
 )

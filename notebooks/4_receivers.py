@@ -84,7 +84,7 @@ irt.receive_active(cube, payload, setup.antennas, r).detections
 # strongest of N/2 cells.
 
 # %%
-heard = frame.samples(("AT", "PT1"))
+received = frame.samples(("AT", "PT1"))
 sight = frame.paths["AT", "PT1"].select(np.array([0]))
 c = 299792458.0
 known = irt.Prediction(
@@ -95,7 +95,7 @@ known = irt.Prediction(
     velocity_std=np.array([0.1]),
     weight=np.ones(1),
 )
-symbols = demodulate.demodulate(heard, known, scenario.modulation.dpsk_order)
+symbols = demodulate.demodulate(received, known, scenario.modulation.dpsk_order)
 print(
     "wrong delay symbols:",
     int((symbols.delay != payload.delay_symbols).sum()),
@@ -114,4 +114,4 @@ figure, ax = plt.subplots(figsize=(8, 2.6))
 ax.plot(10 * np.log10(symbols.delay_confidence[0]), ".")
 ax.set(xlabel="chirp", ylabel="confidence [dB]", title="peak over the mean of the other cells")
 # %%
-irt.receive_passive(heard, setup.antennas, r, scenario.modulation.dpsk_order, known, True)
+irt.receive_passive(received, setup.antennas, r, scenario.modulation.dpsk_order, known, True)

@@ -61,7 +61,7 @@ class Place:
     frames : of a flight
     few : frames of a quick evaluation, 0: it is left out there
     changes : of the scene
-    compared : other sets that hear it too, of `SETS`
+    compared : other sets that receive it too, of `SETS`
     unseen : not used while receivers were built
     """
 
@@ -174,8 +174,8 @@ class FlightJob(Job):
 
 
 def by_frame(results: Results) -> dict[str, list[list[int]]]:
-    """Of every link the frames that its receiver heard: number, whether its transmitter is in sight
-    of it, wrong and all delay symbols, wrong and all DPSK symbols, whether it was read."""
+    """Of every link the frames that its receiver received: number, whether its transmitter is in
+    sight of it, wrong and all delay symbols, wrong and all DPSK symbols, whether it was read."""
     d, out = results.dataset, {}
     uavs = list(d.uav.values)
     for i, (tx, rx) in enumerate(zip(d.transmitter.values, d.receiver.values, strict=True)):
@@ -244,6 +244,6 @@ def of_set(outcome: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
 
 
 def seconds_of(outcome: Mapping[str, Any], link: str) -> float:
-    """Processor seconds that the own receiver of a link took a frame that it heard."""
+    """Processor seconds that the own receiver of a link took a frame that it received."""
     spent = outcome["timing_s"].get("by_set", {}).get(OWN, {}).get(link, float("nan"))
     return float(spent) / max(len(outcome["by_frame"][link]), 1)

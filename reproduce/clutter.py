@@ -27,11 +27,11 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.rayleigh import rayleigh_cells
 from isac_rt.propagation.free_space import friis_amplitude, radar_amplitude
 from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.propagation.settings import Clutter
-from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.cfar import CfarRule
-from isac_rt.receive.clutter_filter import remove_standing
+from isac_rt.receive.clutter_filter import remove_static
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.settings import Receivers
@@ -272,7 +272,7 @@ def at_hits(bench: Bench, kind: Kind, frame: int) -> dict[tuple[bool, str], np.n
         for part, one in parts.items():
             spectra = clean_spectrum(one, known)
             if name == "notch":
-                remove_standing(spectra, schedule, None)
+                remove_static(spectra, schedule, None)
             maps[part] = channel_maps(spectra, known)
         for physical_level in (False, True):
             fixed = maps["targets"]

@@ -20,7 +20,7 @@ from isac_rt.frame.payload import Payload, random_payload
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.free_space import radar_amplitude
 from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.propagation.ways import LinkState
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import add_noise, if_signal

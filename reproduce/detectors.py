@@ -234,7 +234,7 @@ def _ratios(
     if settings.clutter_detector == "cfar":
         rule = CfarRule.of(settings, known.channels)
         return [rule.ratio(accumulate(maps))[0] for maps in frames]
-    judged = AngleDoppler(settings, fitted=fitted).judge(frames, known, Hints(expected))
+    judged = AngleDoppler(settings, fitted=fitted).test_cells(frames, known, Hints(expected))
     return [one.ratio for one in judged]
 
 

@@ -14,7 +14,7 @@ QUICK_EVERY = 10
 WARM_UP = 3
 UAVS = "AT", "PT2"
 PRINTED_FRAMES = 10
-"""Frames of the run as printed, spread over the flight: PT1 hears nothing in any of them."""
+"""Frames of the run as printed, spread over the flight: PT1 receives nothing in any of them."""
 
 
 def run(quick: bool, seed: int, progress: Progress) -> Outcome:

@@ -207,8 +207,8 @@ def run(quick: bool, seed: int, progress: Progress) -> Outcome:
         s = scene(seed, index, frames)
         dataset, said = watch(s)
         parts += [
-            _of_terminal(s, dataset, name, heard).assign(scene=index)
-            for name, heard in said.items()
+            _of_terminal(s, dataset, name, received).assign(scene=index)
+            for name, received in said.items()
         ]
     progress(flights, flights)
     every = pd.concat(parts, ignore_index=True)
@@ -239,8 +239,10 @@ def _of_terminal(
         for f, (t, x) in enumerate(said)
         for k in np.flatnonzero(~t.is_reference)
     ]
-    told = pd.DataFrame(doubt, columns=["frame", "id", "suspect"])
-    return rows.merge(told, on=["frame", "id"]).assign(terminal="passive" if passive else "active")
+    reported = pd.DataFrame(doubt, columns=["frame", "id", "suspect"])
+    return rows.merge(reported, on=["frame", "id"]).assign(
+        terminal="passive" if passive else "active"
+    )
 
 
 say = Sentences("""
@@ -275,10 +277,14 @@ def _verdicts(terminal: str, tracks: pd.DataFrame) -> tuple[Verdict, ...]:
     explained = bool((ghosts.order > 0).all() and (ghosts.face >= 0).all())
     lost = proportion(int(uavs.suspect.sum()), len(uavs)) if len(uavs) else "no track"
     fewer = (kept.what == "ghost").sum() < len(ghosts)
-    told = {"terminal": terminal, "ghosts": len(ghosts), "other": (tracks.what == "other").sum()}
+    reported = {
+        "terminal": terminal,
+        "ghosts": len(ghosts),
+        "other": (tracks.what == "other").sum(),
+    }
     orders = {"first": (ghosts.order == 1).sum(), "second": (ghosts.order == 2).sum()}
     rates = {"without": rate(tracks), "with_it": rate(kept), "lost": lost}
     return (
-        say("explained", explained, **told, **orders),
+        say("explained", explained, **reported, **orders),
         say("removed", bool(fewer), terminal=terminal, **rates),
     )

@@ -32,7 +32,7 @@ from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import generator
 from isac_rt.receive.cfar import CfarRule, first_row
-from isac_rt.receive.clutter_filter import RUN_CELLS, remove_standing
+from isac_rt.receive.clutter_filter import RUN_CELLS, remove_static
 from isac_rt.receive.estimate import Estimate, LocalSpectra, refine, start_point, to_delay
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
@@ -324,7 +324,7 @@ def _active(
     if case.filtered:  # not linear in the samples
         for level in levels(case):
             spectra = signal + np.float32(level) * white
-            remove_standing(spectra, schedule, RUN_CELLS)
+            remove_static(spectra, schedule, RUN_CELLS)
             look = _Look(case, target, spectra, known)
             note("hits", look.at(one_atom_power(spectra, w, schedule))[0])
             _note_united(look, accumulate(channel_maps(spectra, known)), note)

@@ -13,12 +13,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from isac_rt.extensions.city_receivers.self_calibration import SelfCalibration, Sight
+from isac_rt.extensions.city_receivers.self_calibration import KnownDirection, SelfCalibration
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.randomness import generator
 from isac_rt.receive.modes import MODES
-from isac_rt.receive.types import Look
+from isac_rt.receive.types import PathChannels
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from reproduce import SCENES
@@ -71,8 +71,8 @@ def ratios(passes: int, arrays: int, seed: int) -> np.ndarray:
     antennas, rng = paper_antennas(w), generator(seed, "self-calibration", passes)
     total = np.zeros(LOOKS + 1)
     for _ in range(arrays):
-        sent, heard = _errors(rng, antennas.num_tx), _errors(rng, antennas.num_rx)
-        gain = (sent[:, None] * heard).ravel()
+        sent, received = _errors(rng, antennas.num_tx), _errors(rng, antennas.num_rx)
+        gain = (sent[:, None] * received).ravel()
         one = SelfCalibration(w, antennas, passes)
         for number in range(LOOKS + 1):
             total[number] += _square(one, gain, w, antennas, passes, rng)
@@ -80,7 +80,7 @@ def ratios(passes: int, arrays: int, seed: int) -> np.ndarray:
             y = gain * _wave(u, w, antennas, passes) + _noise(rng, gain.size)
             modes = np.zeros((MODES, antennas.num_tx, antennas.num_rx), complex)
             modes[0] = y.reshape(modes.shape[1:])
-            one.learn(Look(0.0, 0.0, modes, SNR), Sight(u, FAR_M, 1e-4))
+            one.learn(PathChannels(0.0, 0.0, modes, SNR), KnownDirection(u, FAR_M, 1e-4))
     return np.sqrt(total / arrays)
 
 

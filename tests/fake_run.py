@@ -219,7 +219,7 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
                 detection_face=np.array([-1, 70123, -1, 5][:detections])
                 if detections
                 else np.zeros(0, int),
-                detection_skirt=np.zeros(detections, bool),
+                detection_sidelobe=np.zeros(detections, bool),
                 symbols=SymbolCount(
                     360, lost // 3, lost // 3, 351, lost, lost // 2, 4293, 2 * lost, 4293, 1
                 )

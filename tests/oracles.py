@@ -120,16 +120,16 @@ def tones_to_second_order(w, t):
         rate, late = t.rate[k] + t.accel[k] * time, 2 * (source - m) * longest
         tau = t.symbol_delay[q, source, p] + t.delay[k] + late
         tau = tau + (t.rate[k] + t.accel[k] * time / 2) * time
-        beat, skirt = float(slope * tau), w.filter_transition
-        outside = min(max(-beat, beat - w.sampling_rate, 0.0) / skirt, 1.0)
+        beat, sidelobe = float(slope * tau), w.filter_transition
+        outside = min(max(-beat, beat - w.sampling_rate, 0.0) / sidelobe, 1.0)
         z = t.factor[k] * t.send[q, source, p] * np.cos(np.pi * outside / 2) ** 2
         if z == 0:
             continue
         sent = tau + t.tx_delay[k, t.antenna[q, source, p]]
         delay = np.poly1d(np.array([t.accel[k] * step**2 / 2, rate * step, sent]))
         phase = delay * ld(w.carrier_frequency) + delay * (since - delay / 2) * slope
-        f0, f1, bend = (float(phase[i] % 1) if i < 2 else float(phase[i]) for i in range(3))
-        bow = 2 * np.pi * bend * half**2
+        f0, f1, curvature = (float(phase[i] % 1) if i < 2 else float(phase[i]) for i in range(3))
+        bow = 2 * np.pi * curvature * half**2
         e = t.rx_delay[k].astype(ld)
         turn = (ld(w.carrier_frequency) + slope * middle) * e - slope * e**2 / 2
         theta = (2 * np.pi * slope * step * half * e).astype(float)[:, None]

@@ -68,7 +68,7 @@ OF_CASES = {
         "mirror_image(velocity, 0.7 * n)",
     ),
     "doppler of a moving target": Bug(
-        "propagation/ways.py", "there.rate + back.rate", "there.rate + 0 * back.rate"
+        "propagation/scatter_paths.py", "there.rate + back.rate", "there.rate + 0 * back.rate"
     ),
     "doppler of a scatterer": Bug(
         "propagation/legs/geometry.py",
@@ -90,7 +90,7 @@ OF_CASES = {
         "mirror_image(acceleration, 0.7 * n)",
     ),
     "acceleration of an echo": Bug(
-        "propagation/ways.py", "there.accel + back.accel", "there.accel - back.accel"
+        "propagation/scatter_paths.py", "there.accel + back.accel", "there.accel - back.accel"
     ),
     "mirror points obey fermat": Bug(
         "propagation/legs/geometry.py",
@@ -133,7 +133,7 @@ OF_CASES = {
         "np.abs(found.amplitude) * state.elements",
     ),
     "conducting plate": Bug(
-        "propagation/ways.py",
+        "propagation/scatter_paths.py",
         "return cls(leg.length, leg.rate",
         "return cls(leg.length / 2, leg.rate",
     ),
@@ -212,7 +212,7 @@ OF_CASES = {
         "length[row], rate[row], accel[row] = 1.00001 * (r1 + r2), v1 + v2, a1 + a2",
     ),
     "sight alone changes no range cell at once": Bug(
-        "propagation/clutter/sight.py",
+        "propagation/clutter/visibility.py",
         "penumbra((q - near.where) / near.width)",
         "1.0 * (q > near.where)",
     ),
@@ -278,12 +278,12 @@ OF_CASES = {
         "strong, rest = tones.select(alone[::-1]), tones.select(~alone)",
     ),
     "mesh to if at rest": Bug(
-        "propagation/ways.py",
+        "propagation/scatter_paths.py",
         "there.length + back.length",
         "2 * there.length",
     ),
     "mesh to if in motion": Bug(
-        "propagation/ways.py",
+        "propagation/scatter_paths.py",
         "there.rate + back.rate",
         "there.rate",
     ),

@@ -87,7 +87,7 @@ def _take_out(
     middle = round(float(w.beat_cells(e.delay, e.delay_rate).mean()))
     rows = np.arange(max(middle - REACH, 0), min(middle + REACH + 1, spectra.shape[2]))
     direction = np.nan_to_num(direction_cosines(e, known))
-    heard, sent = (
+    received, sent = (
         element_delays(positions, direction, known.radius(e.delay))[0] / w.delay_step
         for positions in (known.antennas.rx_positions, known.antennas.tx_positions)
     )
@@ -97,7 +97,7 @@ def _take_out(
             2j * np.pi * (cycles[m] - rows[:, None] * (w.window_length / 2 / w.num_samples))
         )
         for rx in range(spectra.shape[1]):
-            shape = hann_response(w, beat[m] + sent[schedule[m]] + heard[rx] - rows[:, None])
+            shape = hann_response(w, beat[m] + sent[schedule[m]] + received[rx] - rows[:, None])
             path = (e.channels[schedule[m], rx] * shape * turn).astype(np.complex64)
             spectra[m, rx, rows] += path if back else -path
     return slice(int(rows[0]), int(rows[-1]) + 1)

@@ -278,8 +278,8 @@ def test_a_store_that_has_room_is_not_counted_at_every_write(tmp_path, monkeypat
     """A first set-up puts hundreds of things into a folder of thousands: it is looked at when half
     of its room was used, four times for 200 entries that fill nine tenths of it. Planted bug: the
     first look's room is taken for all there will be."""
-    looks, look = [], storage.Store._make_room
-    monkeypatch.setattr(storage.Store, "_make_room", lambda self: looks.append(1) or look(self))
+    looks, visit = [], storage.Store._make_room
+    monkeypatch.setattr(storage.Store, "_make_room", lambda self: looks.append(1) or visit(self))
     store = storage.Store(tmp_path, ".data", 2_300_000)
     for i in range(200):
         store.put(f"{i:03d}" * 4, {"a": np.full(1250, i)})

@@ -39,16 +39,16 @@ def ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
     os.set_blocking(send, False)
 
     def wait() -> None:
-        while (heard := os.read(receive, 1)) and heard[0] not in (signal.SIGINT, *ENDING):
+        while (received := os.read(receive, 1)) and received[0] not in (signal.SIGINT, *ENDING):
             pass
         os.close(receive)
-        if not heard:
+        if not received:
             return
         time.sleep(_GRACE)
         abandon()
         _say_kept(kept)
         say_interrupted()
-        os._exit(128 + heard[0])
+        os._exit(128 + received[0])
 
     before = signal.set_wakeup_fd(send, warn_on_full_buffer=False)
     # one that is ignored stays so: nohup

@@ -137,7 +137,7 @@ class IFCube:
 
 
 class SharedCube(IFCube):
-    """A cube that several receivers hear: what one has made of it the next one need not make."""
+    """A cube that several receivers receive: what one has made of it the next one need not make."""
 
     @cached_property
     def made(self) -> dict[str, Any]:

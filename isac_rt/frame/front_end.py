@@ -86,7 +86,7 @@ class Elements(Node):
     """Phase that each element adds to its IF samples [degrees]; one value is that of all. Empty,
     the default: 0."""
     delay_ps: tuple[Picoseconds, ...] = ()
-    """Delay of each element's line [ps]: it shifts the range of what the element hears or sends.
+    """Delay of each element's line [ps]: it shifts the range of what the element receives or sends.
     One value is that of all, such as of a board: a bias of all ranges. Empty, the default: 0."""
     gain_std_db: GainSpread = 0.0
     """Standard deviation of gains that are drawn for each element once a run [dB]; they add to

@@ -1,4 +1,4 @@
-"""Who hears whom."""
+"""Who receives whom."""
 
 from __future__ import annotations
 

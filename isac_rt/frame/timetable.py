@@ -164,10 +164,10 @@ class Timetable:
         frames where `count` is as large."""
         if count >= self.frames:
             return set(range(self.frames))
-        heard = [
+        received = [
             f
             for f in range(0, self.frames, self.active_every)
             if f >= self.modulation.acquisition_frames or not self.waveform.carries_data
         ] or [0]
-        places = np.linspace(0, len(heard) - 1, min(count, len(heard)))
-        return {heard[i] for i in places.round().astype(int)}
+        places = np.linspace(0, len(received) - 1, min(count, len(received)))
+        return {received[i] for i in places.round().astype(int)}

@@ -23,11 +23,11 @@ TIE = 1e-9
 
 
 @jit(borrows=True)
-def _hear(flat, at, to, heard):
+def _load_channels(flat, at, to, channels_read):
     """Sixteen cells of a channel from `at`: their real parts, then the imaginary ones."""
     a, b = load(flat, at), load(flat, at + LANES)
-    store(heard, to, evens(a, b))
-    store(heard, to + LANES, odds(a, b))
+    store(channels_read, to, evens(a, b))
+    store(channels_read, to + LANES, odds(a, b))
 
 
 @jit
@@ -36,12 +36,12 @@ def line_bounds(maps, channels, spectra, out):
     looks, count = channels.shape
     width, line = maps.shape[1], 2 * LANES * count
     flat = maps.reshape(-1)
-    heard, zero = np.empty(looks * line, np.float32), splat(np.float32(0))
+    channels_read, zero = np.empty(looks * line, np.float32), splat(np.float32(0))
     for first in range(0, out.size, LANES):
         for t in range(looks):
             for e in range(count):
                 at = channels[t, e] * width + 2 * first
-                _hear(flat, at, t * line + 2 * LANES * e, heard)
+                _load_channels(flat, at, t * line + 2 * LANES * e, channels_read)
         largest = zero
         for g in range(0, len(spectra), 2):
             one, other = zero, zero
@@ -49,7 +49,7 @@ def line_bounds(maps, channels, spectra, out):
                 re_1, im_1, re_2, im_2 = zero, zero, zero, zero
                 for e in range(count):
                     to = t * line + 2 * LANES * e
-                    re, im = load(heard, to), load(heard, to + LANES)
+                    re, im = load(channels_read, to), load(channels_read, to + LANES)
                     c, s = splat(spectra[g, e].real), splat(spectra[g, e].imag)
                     re_1, im_1 = re_1 + c * re - s * im, im_1 + c * im + s * re
                     c, s = splat(spectra[g + 1, e].real), splat(spectra[g + 1, e].imag)
@@ -65,12 +65,12 @@ def search_directions(along_x, along_z, turns_z, turns_x, inside, scale, peak, p
     """`isac_rt.receive.directions.search_directions`, sixteen directions at once."""
     looks, size, lines = along_x.shape[1], along_x.shape[3], along_z.shape[2]
     turns, each, power = turns_z.reshape(-1), scale.reshape(-1), np.empty(size * size, np.float32)
-    heard, zero = np.empty(looks * 2 * lines * size, np.float32), splat(np.float32(0))
+    channels_read, zero = np.empty(looks * 2 * lines * size, np.float32), splat(np.float32(0))
     sine, line = turns_z.shape[1] * size, 2 * lines * size
     for s in range(along_x.shape[0]):
         norm = min(s, scale.shape[0] - 1) * power.size
         for t in range(looks):
-            _apart(along_z[s, t], heard[t * line : (t + 1) * line])
+            _apart(along_z[s, t], channels_read[t * line : (t + 1) * line])
         for i in range(size):
             for j in range(0, size, LANES):
                 total = zero
@@ -83,7 +83,7 @@ def search_directions(along_x, along_z, turns_z, turns_x, inside, scale, peak, p
                     for k in range(lines):
                         a, b = splat(turns_x[0, k, i]), splat(turns_x[1, k, i])
                         at = t * line + k * size + j
-                        c, d = load(heard, at), load(heard, at + lines * size)
+                        c, d = load(channels_read, at), load(channels_read, at + lines * size)
                         re, im = re + a * c - b * d, im + a * d + b * c
                     total = total + (re * re + im * im)
                 at = i * size + j
@@ -162,7 +162,7 @@ def quadratic_forms(matrices, order, x, z, out):
     count, size, pair = order.size, x.cosines.shape[0], 2 * LANES
     num_x, num_z = x.cosines.shape[1], z.cosines.shape[1]
     two, least = np.float32(2), splat(np.float32(1e-6))
-    heard = np.empty(count * count * pair, np.float32)
+    channels_read = np.empty(count * count * pair, np.float32)
     total = np.empty(size * size * LANES, np.float32)
     near, flat = np.empty(num_z * pair, np.float32), out.reshape(-1)
     far = np.empty((2, x.ends.size - 1, size, num_z), np.float32)
@@ -179,16 +179,16 @@ def quadratic_forms(matrices, order, x, z, out):
             for m in range(count):
                 for n in range(count):
                     value, at = matrix[order[m], order[n]], (n * count + m) * pair + s
-                    heard[at], heard[at + LANES] = value.real, value.imag
+                    channels_read[at], channels_read[at + LANES] = value.real, value.imag
         total[:] = 0.0
-        _within(heard, count, 0, x, total, size, 1)
-        _within(heard, count, num_x, z, total, 1, size)
+        _within(channels_read, count, 0, x, total, size, 1)
+        _within(channels_read, count, num_x, z, total, 1, size)
         for i in range(size):
             for p in range(x.ends.size - 1):
                 for r in range(z.ends.size - 1):
                     c, d = splat(two * z.turns[0, r, i]), splat(two * z.turns[1, r, i])
                     for n in range(z.ends[r], z.ends[r + 1]):
-                        re, im = _sum(heard, count, num_x + n, x, p, 0, i)
+                        re, im = _sum(channels_read, count, num_x + n, x, p, 0, i)
                         store(near, n * pair, re * c + im * d)
                         store(near, n * pair + LANES, im * c - re * d)
                 for j in range(size):
@@ -206,19 +206,19 @@ def quadratic_forms(matrices, order, x, z, out):
 
 
 @jit(fast=True, borrows=True)
-def _sum(heard, count, n, lines, p, begin, g):
+def _sum(channels_read, count, n, lines, p, begin, g):
     """Sum over the channels m of line p of conj(a_m) Q_mn, real and imaginary part."""
     re, im = splat(np.float32(0)), splat(np.float32(0))
     for m in range(lines.ends[p], lines.ends[p + 1]):
         at = (n * count + begin + m) * 2 * LANES
-        a, b = load(heard, at), load(heard, at + LANES)
+        a, b = load(channels_read, at), load(channels_read, at + LANES)
         c, d = splat(lines.cosines[g, m]), splat(lines.sines[g, m])
         re, im = re + a * c - b * d, im + b * c + a * d
     return re, im
 
 
 @jit(fast=True, borrows=True)
-def _within(heard, count, begin, lines, total, step, other):
+def _within(channels_read, count, begin, lines, total, step, other):
     """Add what an axis' own lines, whose channels begin at `begin`, have of `quadratic_forms`;
     `step` and `other` are those from one of their own directions to the next, and across."""
     size = lines.cosines.shape[0]
@@ -227,7 +227,7 @@ def _within(heard, count, begin, lines, total, step, other):
             for q in range(lines.ends.size - 1):
                 re, im = splat(np.float32(0)), splat(np.float32(0))
                 for n in range(lines.ends[q], lines.ends[q + 1]):
-                    a, b = _sum(heard, count, begin + n, lines, p, begin, g)
+                    a, b = _sum(channels_read, count, begin + n, lines, p, begin, g)
                     c, d = splat(lines.cosines[g, n]), splat(lines.sines[g, n])
                     re, im = re + a * c + b * d, im + b * c - a * d
                 for h in range(size):

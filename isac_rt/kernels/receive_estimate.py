@@ -220,7 +220,7 @@ def estimate(spectra, chirps, axis, lows, counts, delays, rates, steps, units, o
 
 
 @jit
-def add_template(spectra, rows, channels, schedule, beat, turn, sent, heard, window):
+def add_template(spectra, rows, channels, schedule, beat, turn, sent, received, window):
     """`isac_rt.receive.pursuit.add_template`."""
     length, size = window
     share = length / size
@@ -231,7 +231,7 @@ def add_template(spectra, rows, channels, schedule, beat, turn, sent, heard, win
         for rx in range(spectra.shape[1]):
             for p in range(num_chirps):
                 tx = schedule[m, p]
-                near[p] = (beat[m, p] + sent[tx] + heard[rx] - rows[0]) * share
+                near[p] = (beat[m, p] + sent[tx] + received[rx] - rows[0]) * share
                 sine[p], cosine[p] = np.sin(np.pi * near[p]), np.cos(np.pi * near[p])
                 factor[p] = channels[tx, rx] * turn[m, p] * (length / 2)
             for i in range(rows[1] - rows[0]):

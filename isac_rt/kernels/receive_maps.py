@@ -49,13 +49,13 @@ def fill_tones(frequency, out):
 
 
 @jit(borrows=True)
-def make_maps(flat, shape, ends, places, factors, room, maps, spare, power):
+def make_maps(flat, shape, ends, places, factors, workspace, maps, buffer, power):
     """`isac_rt.receive.maps.make_maps`; unsigned places, so that no index is checked for its sign.
 
     An operator is a real matrix before the DFT, so that its rows of opposite bins are conjugates.
     With a + j b such a row and x + j y the samples, both bins follow from a x, b x, a y and b y:
     half of the multiplications. A block of bins stays in the first-level cache for some rows, and
-    what is made of these in `room`.
+    what is made of these in `workspace`.
     """
     num_rx, num_rows, num_chirps = shape[1:]
     size, operators = factors.shape[0] * PART, factors.reshape(-1)
@@ -69,16 +69,18 @@ def make_maps(flat, shape, ends, places, factors, room, maps, spare, power):
                     for i in range(first, last, 3):
                         rows = i, min(i + 1, last - 1), min(i + 2, last - 1)
                         samples = flat, rx * num_rows, 2 * num_chirps
-                        _three_rows(samples, rows, sent, operators, at, room, first, (size, block))
-                lines = maps[tx, rx, first:last] if maps.shape[0] else spare[: last - first]
+                        _three_rows(
+                            samples, rows, sent, operators, at, workspace, first, (size, block)
+                        )
+                lines = maps[tx, rx, first:last] if maps.shape[0] else buffer[: last - first]
                 for i in range(last - first):
-                    made = room[4 * i * size : 4 * (i + 1) * size]
+                    made = workspace[4 * i * size : 4 * (i + 1) * size]
                     _join_bins(made.view(np.complex64), lines[i])
                 _add_power(power[first:last], lines)
 
 
 @jit(borrows=True)
-def _three_rows(samples, rows, places, operators, at, room, first, part):
+def _three_rows(samples, rows, places, operators, at, workspace, first, part):
     """A block of bins and the opposite ones, of three rows at once: their twelve sums, both factors
     and a sample's two parts fill the registers of a processor that has sixteen."""
     flat, before, step = samples
@@ -100,24 +102,24 @@ def _three_rows(samples, rows, places, operators, at, room, first, part):
         x, y = flat[r2 + p], flat[r2 + p + imag]
         ax2, bx2, ay2, by2 = ax2 + a * x, bx2 + b * x, ay2 + a * y, by2 + b * y
         at += 2 * PART
-    _keep_both(room, rows[0] - first, part, ax0, bx0, ay0, by0)
-    _keep_both(room, rows[1] - first, part, ax1, bx1, ay1, by1)
-    _keep_both(room, rows[2] - first, part, ax2, bx2, ay2, by2)
+    _keep_both(workspace, rows[0] - first, part, ax0, bx0, ay0, by0)
+    _keep_both(workspace, rows[1] - first, part, ax1, bx1, ay1, by1)
+    _keep_both(workspace, rows[2] - first, part, ax2, bx2, ay2, by2)
 
 
 @jit(inline=True)
-def _keep_both(room, row, part, ax, bx, ay, by):
-    """Write a block of bins to a row's part of `room`, and the opposite bins, the lowest first, at
-    its end."""
+def _keep_both(workspace, row, part, ax, bx, ay, by):
+    """Write a block of bins to a row's part of `workspace`, and the opposite bins, the lowest
+    first, at its end."""
     size, block = part
     begin = 4 * row * size + 2 * block * PART
     end = 4 * (row + 1) * size - 2 * (block + 1) * PART
     re, im = ax - by, bx + ay
-    store(room, begin, zip_low(re, im))
-    store(room, begin + PART, zip_high(re, im))
+    store(workspace, begin, zip_low(re, im))
+    store(workspace, begin + PART, zip_high(re, im))
     re, im = backwards(ax + by), backwards(ay - bx)
-    store(room, end, zip_low(re, im))
-    store(room, end + PART, zip_high(re, im))
+    store(workspace, end, zip_low(re, im))
+    store(workspace, end + PART, zip_high(re, im))
 
 
 @jit(borrows=True)

@@ -111,7 +111,7 @@ def _unload(added, first, count, power):
 def _write(table, at, turns, first, count, out):
     """out[i, first + l] = the cells, times g where there is one; past the caches where whole cache
     lines are written, which are not read from memory first then."""
-    flat, width, spare = out.reshape(-1), out.shape[1], np.empty(ROW, np.float32)
+    flat, width, buffer = out.reshape(-1), out.shape[1], np.empty(ROW, np.float32)
     whole = out.ctypes.data % 64 == 0 and width % LANES == 0
     for i in range(at.size):
         a, b = load(table, at[i]), load(table, at[i] + LANES)
@@ -127,6 +127,6 @@ def _write(table, at, turns, first, count, out):
             store(flat, to, zip_low(a, b))
             store(flat, to + LANES, zip_high(a, b))
         else:
-            store(spare, 0, zip_low(a, b))
-            store(spare, LANES, zip_high(a, b))
-            flat[to : to + 2 * count] = spare[: 2 * count]
+            store(buffer, 0, zip_low(a, b))
+            store(buffer, LANES, zip_high(a, b))
+            flat[to : to + 2 * count] = buffer[: 2 * count]

@@ -94,7 +94,7 @@ def _turn(out, at, cycles, amplitude):
 
 
 @jit(fast=True, borrows=True)
-def _tone(room, half, amplitude, phase, frequency, quadratic):
+def _tone(workspace, half, amplitude, phase, frequency, quadratic):
     """Add amplitude exp(j 2 pi (phase + frequency x + quadratic x^2)), x = n - N/2, to the sums: of
     each 16 samples real parts, then imaginary ones.
 
@@ -102,16 +102,16 @@ def _tone(room, half, amplitude, phase, frequency, quadratic):
     X^2) exp(frequency i + quadratic i^2) (1 + j 4 pi quadratic X i), all phases reduced in float64;
     what is left out is the square of the last term, 1e-8 at 15 m/s.
     """
-    sums, starts, lane, places = room
+    sums, starts, lane, places = workspace
     within = load(places, 0)
     _turn(lane, 0, within * (splat(frequency) + within * splat(quadratic)), 1.0 + 0.0j)
     lr, li, offset = load(lane, 0), load(lane, 16), narrow(within)
     mr, mi = offset * lr, offset * li
-    blocks, bend = sums.shape[0] // 32, np.float32(4 * np.pi * quadratic)
+    blocks, curvature = sums.shape[0] // 32, np.float32(4 * np.pi * quadratic)
     for first in range(0, blocks, LANES):
         x = load(places, 16) + splat(first * LANES - half)
         _turn(starts, 0, splat(phase) + x * (splat(frequency) + x * splat(quadratic)), amplitude)
-        cross = narrow(x) * splat(bend)
+        cross = narrow(x) * splat(curvature)
         store(starts, 32, splat(np.float32(0)) - cross * load(starts, 16))
         store(starts, 48, cross * load(starts, 0))
         for i in range(min(LANES, blocks - first)):
@@ -157,7 +157,7 @@ def _turned(sums, turn):
         sums[at], sums[at + 16] = re * c - im * s, re * s + im * c
 
 
-class _Room(NamedTuple):
+class _Workspace(NamedTuple):
     """Memory of the kernel: sums of a chirp, phasors of 16 blocks and within one, and the places of
     the 16 within a block and of the 16 blocks' middles."""
 
@@ -173,25 +173,27 @@ class OneByOne(NamedTuple):
     path: np.ndarray
     offset: np.ndarray
     tones: Any
-    room: _Room
+    workspace: _Workspace
 
 
 def one_by_one(waveform: Any, tones: Any) -> OneByOne:
-    """All that is heard of some tones, for the kernels."""
+    """All that is received of some tones, for the kernels."""
     lanes = np.arange(LANES)
     places = np.concatenate([lanes, lanes * LANES]) + (LANES - 1) / 2 * np.repeat(
         [-1.0, 1.0], LANES
     )
     blocks = -(-waveform.num_samples // LANES)
-    room = _Room(aligned(2 * LANES * blocks), aligned(4 * LANES), aligned(2 * LANES), places)
+    workspace = _Workspace(
+        aligned(2 * LANES * blocks), aligned(4 * LANES), aligned(2 * LANES), places
+    )
     path, offset = tones.sources(waveform)
-    return OneByOne(path, offset, tones, room)
+    return OneByOne(path, offset, tones, workspace)
 
 
 @jit(fast=True, borrows=True)
 def sum_paths(alone, w, half, m, r, p):
     """Add the paths to the sums of chirp p of group m at element r; how many it has."""
-    path, offset, t, room = alone
+    path, offset, t, workspace = alone
     groups, time, count = t.send.shape[1], w.first + p * w.slot + m * w.spacing, 0
     for i in range(path.shape[0]):
         k, source = path[i], m - offset[i]
@@ -214,7 +216,7 @@ def sum_paths(alone, w, half, m, r, p):
             amplitude *= t.rx_gain[k, r]
         element = tau + t.tx_delay[k, a] + t.rx_delay[k, r] + t.cross[t.cross_row[k], a, r]
         terms = chirp_terms(w, element, t.rate[k] + t.accel[k] * time, t.accel[k])
-        _tone(room, half, amplitude, *terms)
+        _tone(workspace, half, amplitude, *terms)
         count += 1
     return count
 
@@ -223,7 +225,7 @@ def sum_paths(alone, w, half, m, r, p):
 def _direct(out, shape, w, alone, fresh, turn):
     """Add the paths to the samples of `shape`, or write them."""
     groups, num_rx, chirps, num_samples = shape
-    half, sums = float(num_samples // 2), alone.room.sums
+    half, sums = float(num_samples // 2), alone.workspace.sums
     for line in range(groups * num_rx * chirps):  # as they lie in memory
         m, r, p = line // (num_rx * chirps), line // chirps % num_rx, line % chirps
         if sum_paths(alone, w, half, m, r, p) == 0 and not fresh:

@@ -27,25 +27,25 @@ import scipy.fft
 
 from isac_rt.kernels.fourier import ROW, plan, transform
 from isac_rt.kernels.jit import jit
-from isac_rt.kernels.signal_covered import (
+from isac_rt.kernels.signal_below_noise import (
     EXTRA,
     TAPS,
     Batches,
-    Covered,
-    Desk,
-    Sheet,
-    add_covered,
+    BelowNoisePaths,
+    Buffer,
+    Workspace,
+    add_below_noise,
     batches,
-    covered_paths,
-    desk,
+    below_noise_paths,
     line_turn,
+    make_workspace,
     no_paths,
     part_slots,
     plain_batches,
     turn_elements,
 )
 from isac_rt.kernels.signal_direct import OneByOne, flush, numbers, one_by_one, passed, sum_paths
-from isac_rt.kernels.signal_noise import add_stream_by, words_room
+from isac_rt.kernels.signal_noise import add_stream_by, words_buffer
 from isac_rt.kernels.vector import (
     LANES,
     aligned,
@@ -229,12 +229,12 @@ class _Blocks(NamedTuple):
 class _Faint(NamedTuple):
     """Paths that noise covers, how they are spread, and the memory of their sums."""
 
-    paths: Covered
-    sheet: Sheet
-    desk: Desk
+    paths: BelowNoisePaths
+    buffer: Buffer
+    workspace: Workspace
 
 
-class _Heard(NamedTuple):
+class _Contributions(NamedTuple):
     """Received paths: blocks of them, their `_steering`, the below-noise paths, and what is added
     past the grid."""
 
@@ -244,7 +244,7 @@ class _Heard(NamedTuple):
     alone: OneByOne
 
 
-class _Room(NamedTuple):
+class _Workspace(NamedTuple):
     """Memory of the kernel: the grids, numbers of 16 paths, their places and frequencies, their
     weights, what is emitted, and random words of its noise."""
 
@@ -283,16 +283,18 @@ def _prepare(work, places, b, block, w, g, time, symbol, send, antenna):
     cell = floor(place)
     store(places, 0, cell)
     store(work, 0, narrow(place - cell) - splat(_HALF))
-    bend = narrow(
+    curvature = narrow(
         (sent * a + splat(slope) * step * (splat(ts) - splat(0.5) * step)) * splat(half * half)
     )
-    c, s = cos_sin(narrow(cycles - floor(cycles + splat(0.5))) + bend * splat(np.float32(g.centre)))
+    c, s = cos_sin(
+        narrow(cycles - floor(cycles + splat(0.5))) + curvature * splat(np.float32(g.centre))
+    )
     br, bi = load(b.factor, f), load(b.factor, f + 16)
     sr, si = splat(np.float32(send.real)), splat(np.float32(send.imag))
     ar, ai = br * sr - bi * si, br * si + bi * sr
     store(work, 16, ar * c - ai * s)
     store(work, 32, ar * s + ai * c)
-    store(work, 48, bend * splat(np.float32(2 * np.pi)))
+    store(work, 48, curvature * splat(np.float32(2 * np.pi)))
     store(work, 64, narrow(tau * splat(1 / (ts * half))))
 
 
@@ -408,17 +410,17 @@ def _emit(out, at, stride, channels, num_samples, tile):
 
 
 @jit(fast=True, borrows=True)
-def _chirps(out, shape, first_channel, w, g, heard, t, noise, room):
+def _chirps(out, shape, first_channel, w, g, contributions, t, noise, workspace):
     """Synthesise all chirps for up to 16 receive elements, in this order: spread, transform, divide
     and add paths one by one and noise, emit, one batch of chirps after the other."""
-    grid, work, places, scratch, tile, words = room
+    grid, work, places, scratch, tile, words = workspace
     power, key0, key1 = noise
-    b, steer, faint, alone = heard
+    b, steer, faint, alone = contributions
     groups, num_rx, num_chirps, num_samples = shape
     size, width = g.rows.shape[0], len(g.taps)
     low, centre, channels = width // 2 - 1, np.float32(g.centre), min(16, num_rx - first_channel)
-    top, skirt = w.rate / w.slope, w.transition / w.slope
-    cut = top + skirt
+    top, sidelobe = w.rate / w.slope, w.transition / w.slope
+    cut = top + sidelobe
     stride = (size + _MARGIN) * ROW
     for batch in range(g.order.parts.shape[0]):
         start, count, segment = g.order.parts[batch]
@@ -434,7 +436,7 @@ def _chirps(out, shape, first_channel, w, g, heard, t, noise, room):
                 time = w.first + p * w.slot + m * w.spacing
                 delay = t.symbol_delay[q, source, p]
                 least, most = b.bounds[i, 0] + delay, b.bounds[i, 1] + delay
-                if least > cut or most < -skirt:
+                if least > cut or most < -sidelobe:
                     continue
                 send, antenna = t.send[q, source, p], t.antenna[q, source, p]
                 _prepare(work, places, b, i, w, g, time, delay, send, antenna)
@@ -444,7 +446,7 @@ def _chirps(out, shape, first_channel, w, g, heard, t, noise, room):
                 _weigh(work, scratch, g.poly, g.taps)
                 _spread(grid, to, places, scratch, used, g.taps, steer, k, work, centre)
         if faint.paths.groups.shape[0]:
-            add_covered(grid, faint.paths, segment, chirps, t, w, faint.sheet, faint.desk)
+            add_below_noise(grid, faint.paths, segment, chirps, t, w, faint.buffer, faint.workspace)
         for c in range(count):
             m, p = chirps[c] // num_chirps, chirps[c] % num_chirps
             table = grid[c * stride : (c + 1) * stride]
@@ -456,7 +458,7 @@ def _chirps(out, shape, first_channel, w, g, heard, t, noise, room):
             for r in range(channels):
                 here = _TILE + r * (2 * num_samples + ROW)
                 if sum_paths(alone, w, g.half, m, first_channel + r, p):
-                    flush(tile, here, num_samples, alone.room.sums, False)
+                    flush(tile, here, num_samples, alone.workspace.sums, False)
                 if power > 0:
                     chirp = tile[here : here + 2 * num_samples]
                     draw = ((line + r) * num_chirps + p) * num_samples
@@ -547,7 +549,7 @@ def make_gridded(
     Parameters
     ----------
     samples : (M, L_rx, P, N) complex64, contiguous, which is written
-    tones : at least one of them heard
+    tones : at least one of them received
     faint : (K,) bool, paths that noise covers; those that live for a part of the frame are made as
         the others
     alone : `Tones` that are added one by one
@@ -576,7 +578,7 @@ def make_gridded(
         order,
     )
     stride = (kernel.grid + _MARGIN) * ROW
-    sheet = Sheet(
+    buffer = Buffer(
         kernel.grid,
         line_turn(kernel.grid, g.half) ** 2 * g.centre / 2,
         stride,
@@ -585,7 +587,9 @@ def make_gridded(
     )
     grids = unset(int(order.parts[:, 1].max()) * stride)
     tile = aligned(_TILE + LANES * (2 * w.num_samples + ROW))
-    room = _Room(grids, aligned(80), np.zeros(16), aligned(_STEP * WIDTH), tile, words_room())
+    workspace = _Workspace(
+        grids, aligned(80), np.zeros(16), aligned(_STEP * WIDTH), tile, words_buffer()
+    )
     flat, rx, shared = samples.reshape(-1).view(np.float32), (t.rx_delay, t.rx_gain), numbers(w)
     one_after_the_other = one_by_one(w, alone)
     for first in range(0, shape[1], LANES):
@@ -593,9 +597,11 @@ def make_gridded(
         paths = no_paths(t.tx_delay.shape[1])
         if apart.any():
             steering = partial(_turned_steering, w, rx, first, kernel.grid)
-            paths = covered_paths(w, t, weak, slots, kernel.grid, g.centre, steering)
-        heard = _Heard(b, steer, _Faint(paths, sheet, desk(paths)), one_after_the_other)
-        _chirps(flat, shape, first, shared, g, heard, t, noise, room)
+            paths = below_noise_paths(w, t, weak, slots, kernel.grid, g.centre, steering)
+        contributions = _Contributions(
+            b, steer, _Faint(paths, buffer, make_workspace(paths)), one_after_the_other
+        )
+        _chirps(flat, shape, first, shared, g, contributions, t, noise, workspace)
 
 
 def _turned_steering(
@@ -606,7 +612,7 @@ def _turned_steering(
     path: np.ndarray,
     late: np.ndarray,
 ) -> np.ndarray:
-    """`_steering` for `Covered`: with what the paths' own delays, in half chirps, do to the
+    """`_steering` for `BelowNoisePaths`: with what the paths' own delays, in half chirps, do to the
     frequency that the elements see."""
     out = _steering(waveform, rx, path, first)
     turn_elements(out, late, line_turn(size, waveform.num_samples // 2))

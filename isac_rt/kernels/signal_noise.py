@@ -166,6 +166,6 @@ def add_stream_by(out, power, key0, key1, first, words):
         _add_gaussians(out[2 * start : 2 * (start + _BLOCK)], power, words[0], words[1])
 
 
-def words_room() -> np.ndarray:
+def words_buffer() -> np.ndarray:
     """For `add_stream_by`."""
     return np.empty((2, _BLOCK), np.uint32)

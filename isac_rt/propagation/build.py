@@ -24,7 +24,7 @@ class Ground:
     propagation, clutter : settings
     swarm, city, waveform : of the run
     free : closed forms of the lines of sight and echoes in free space
-    knot_spacing : flight between the places from which rays search for walls [m]; 0: they search
+    sample_spacing : flight between the places from which rays search for walls [m]; 0: they search
         from where a terminal is (`legs.chains`)
     floor : noise that covers scatterers of the clutter field, which then are merged; None: all stay
     """
@@ -35,7 +35,7 @@ class Ground:
     city: CityMesh
     waveform: Waveform
     free: FreeSpace
-    knot_spacing: float = 0.0
+    sample_spacing: float = 0.0
     floor: NoiseFloor | None = None
 
 
@@ -54,7 +54,7 @@ def ray_traced(ground: Ground) -> Propagation:
     g = ground
     carrier = g.waveform.carrier_frequency
     return RayTracer(
-        g.propagation, g.clutter, g.swarm, g.free, g.city, carrier, g.knot_spacing, g.floor
+        g.propagation, g.clutter, g.swarm, g.free, g.city, carrier, g.sample_spacing, g.floor
     )
 
 

@@ -15,7 +15,7 @@ from isac_rt.propagation.legs.geometry import Legs, straight
 from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, merge
 from isac_rt.propagation.rcs import CrossSection
-from isac_rt.propagation.ways import LinkState, Ways
+from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
 from isac_rt.world.settings import Uav
 from isac_rt.world.swarm import Pose
 
@@ -58,7 +58,7 @@ class FreeSpace:
         return {name: CrossSection(uav.rcs, name, self.seed) for name, uav in self.uavs.items()}
 
     def trace(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Traced:
-        """Paths of every link; those that no element sends or hears are left out."""
+        """Paths of every link; those that no element sends or receives are left out."""
         states = [
             LinkState(Link(tx, rx), epoch, poses[tx], poses[rx], self.names) for tx, rx in links
         ]
@@ -75,15 +75,19 @@ class FreeSpace:
     def _line_of_sight(self, state: LinkState) -> PathSet:
         """The straight path of a link, by Friis."""
         end = state.end
-        ways = Ways.along(straight(state.start, end.position[None], end.velocity, end.acceleration))
-        gain = friis_amplitude(self.wavelength, ways.length) * state.elements(self.antennas, ways)
-        return state.paths(ways, gain, PathKind.LINE_OF_SIGHT)
+        scatter_paths = ScatterPaths.along(
+            straight(state.start, end.position[None], end.velocity, end.acceleration)
+        )
+        gain = friis_amplitude(self.wavelength, scatter_paths.length) * state.elements(
+            self.antennas, scatter_paths
+        )
+        return state.paths(scatter_paths, gain, PathKind.LINE_OF_SIGHT)
 
     def _echoes(self, state: LinkState, poses: dict[str, Pose]) -> PathSet:
         """Echoes of every UAV that is neither end, straight there and straight on."""
         others = [name for name in self.names if name not in state.link]
         there, back = (self._legs(end, others, poses) for end in (state.start, state.end))
-        ways = Ways.over(there, back)
+        scatter_paths = ScatterPaths.over(there, back)
         amplitude = np.empty(len(others))
         for k, name in enumerate(others):
             rcs, row = self.uavs[name].rcs, slice(k, k + 1)
@@ -92,10 +96,10 @@ class FreeSpace:
                 amplitude[k] *= 10 ** (rcs.level_db / 20)
             else:
                 amplitude[k] = self._echo(name, poses, there.select(row), back.select(row))
-        elements = state.elements(self.antennas, ways)
+        elements = state.elements(self.antennas, scatter_paths)
         relative = np.array([self.uavs[name].rcs.model == "relative" for name in others], bool)
         return state.paths(
-            ways,
+            scatter_paths,
             np.where(relative, amplitude * (elements > 0), amplitude * elements),
             PathKind.TARGET,
             target=np.array([self.names.index(name) for name in others], int),

@@ -122,7 +122,7 @@ class PathSet:
 
     @property
     def link(self) -> Link:
-        """Who hears whom."""
+        """Who receives whom."""
         return Link(self.tx, self.rx)
 
     @cached_property

@@ -2,11 +2,11 @@
 them are paths, and where.
 
 Legs run from the terminals to every UAV: terminal to terminal, terminal back to itself, and
-terminal to target. Rays that leave the terminals from knots of their flights find which walls a
-wave may meet one after the other (`legs.chains`); images place the pooled chains in each frame
-(`legs.images`), with length, rate, acceleration, directions and points from the planes of the mesh,
-and slab coefficients of the faces that hold the points. Straight legs then bend round shadow edges,
-and the swarm's bodies shadow legs of all kinds (`direct`, `bodies`).
+terminal to target. Rays that leave the terminals from time samples of their flights find which
+walls a wave may meet one after the other (`legs.chains`); images place the pooled chains in each
+frame (`legs.images`), with length, rate, acceleration, directions and points from the planes of the
+mesh, and slab coefficients of the faces that hold the points. Straight legs then bend round shadow
+edges, and the swarm's UAVs shadow legs of all kinds (`direct`, `discs`).
 
 `RayTracer.by_sionna` gives the same tracer with the legs of Sionna's own solver, which shares with
 the above neither the search nor the images, the visibility nor the amplitudes (its delays are
@@ -14,7 +14,7 @@ unfolded in float64 too: in float32 they are off by up to a radian and more at t
 the cross-check of the paths that a run misses.
 
 Echoes and ghosts of UAVs are products of legs with the amplitude sqrt(4 pi sigma)/lambda, a point
-scatterer. Sionna's own RCS solver gives the same paths, but wants the bodies in the scene, where
+scatterer. Sionna's own RCS solver gives the same paths, but wants the UAVs in the scene, where
 each shadows the terminal that carries it, and one solve per link; a test holds the two against each
 other. What is left out: a wave that one leg turns from vertical to horizontal polarisation and the
 other turns back (nothing for echoes and for ghosts of one bounce, up to 6 % of single ghosts of two
@@ -39,13 +39,13 @@ from isac_rt.frame.link import Link
 from isac_rt.propagation.clutter.cells import Density
 from isac_rt.propagation.clutter.field import ClutterField
 from isac_rt.propagation.clutter.merging import NoiseFloor
-from isac_rt.propagation.clutter.sight import Flight
 from isac_rt.propagation.clutter.two_bounces import TwoBounces
+from isac_rt.propagation.clutter.visibility import Flight
 from isac_rt.propagation.free_space import FreeSpace
-from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.chains import Search
 from isac_rt.propagation.legs.clearance import Clearance
-from isac_rt.propagation.legs.direct import past_edges_and_bodies
+from isac_rt.propagation.legs.direct import past_edges_and_discs
+from isac_rt.propagation.legs.discs import UavDiscs
 from isac_rt.propagation.legs.edges import ShadowEdges
 from isac_rt.propagation.legs.geometry import (
     edges_in_any_order,
@@ -58,8 +58,8 @@ from isac_rt.propagation.legs.legset import LegSet, TracedLegs, leg_set
 from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
+from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
 from isac_rt.propagation.settings import Clutter, Propagation
-from isac_rt.propagation.ways import LinkState, Ways
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.city.scene import shared_scenes
 from isac_rt.world.swarm import Pose, Swarm
@@ -71,7 +71,7 @@ MOST_PATHS = 4_000_000
 """Paths per source that the ray tracer is given room for. It drops what is beyond in silence, so
 fewer rays get less room."""
 LEAKAGE_S = 1e-9
-"""Delay of what a receiver hears of its own transmitter: 30 cm of way."""
+"""Delay of what a receiver receives of its own transmitter: 30 cm of way."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -87,7 +87,7 @@ class RayTracer:
         free: FreeSpace,
         city: CityMesh,
         carrier: float,
-        knot_spacing: float = 0.0,
+        sample_spacing: float = 0.0,
         floor: NoiseFloor | None = None,
     ) -> None:
         self._propagation, self._clutter, self._swarm = propagation, clutter, swarm
@@ -114,8 +114,8 @@ class RayTracer:
                 )
         depth = propagation.max_bounces if city.num_faces else 0
         flights = {
-            name: Flight(swarm.trajectories[name], swarm.duration, city.origin, knot_spacing)
-            for name in (self._terminals if knot_spacing and depth else [])
+            name: Flight(swarm.trajectories[name], swarm.duration, city.origin, sample_spacing)
+            for name in (self._terminals if sample_spacing and depth else [])
         }
         self._search = Search(self._scenes, city, propagation.rays, depth, flights)
         self._images = Images(city, shadows, wavelength, depth)
@@ -141,8 +141,8 @@ class RayTracer:
         )
 
     def by_half(self, which: int) -> RayTracer:
-        """The same tracer with the chains of the even (0) or the odd (1) knots alone, without
-        scatterers."""
+        """The same tracer with the chains of the even (0) or the odd (1) time samples alone,
+        without scatterers."""
         out = copy.copy(self)
         out.field = out.two_bounces = None
         out._search = self._search.half(which)
@@ -178,12 +178,12 @@ class RayTracer:
             legs = self._images.legs(chains, {name: local[name] for name in self._free.names})
         else:
             legs, dropped, _ = self._solved_legs(local, self._solved_with)
-        bodies = Bodies.of(self._swarm.uavs, local)
-        legs = past_edges_and_bodies(legs, local, self._edges, bodies, self._free.wavelength)
+        discs = UavDiscs.of(self._swarm.uavs, local)
+        legs = past_edges_and_discs(legs, local, self._edges, discs, self._free.wavelength)
         paths = {}
         for link in links:
             state = LinkState(link, epoch, local[link.tx], local[link.rx], self._free.names)
-            paths[link] = self._link(state, local, legs, bodies)
+            paths[link] = self._link(state, local, legs, discs)
         return Traced(paths, dropped)
 
     def _local(self, poses: dict[str, Pose]) -> dict[str, Pose]:
@@ -333,7 +333,7 @@ class RayTracer:
         state: LinkState,
         local: dict[str, Pose],
         legs: dict[Link, LegSet],
-        bodies: Bodies,
+        discs: UavDiscs,
     ) -> PathSet:
         link, antennas = state.link, self._free.antennas
         parts = [self._by_the_city(state, legs[link])]
@@ -341,9 +341,9 @@ class RayTracer:
         if others:
             parts.append(self._by_way_of(state, {name: local[name] for name in others}, legs))
         if self.field is not None:
-            parts.append(self.field.paths(state, antennas, bodies))
+            parts.append(self.field.paths(state, antennas, discs))
         if self.two_bounces is not None:
-            parts.extend(self.two_bounces.paths(state, antennas, bodies))
+            parts.extend(self.two_bounces.paths(state, antennas, discs))
         if link.own and self._propagation.leakage.enabled:
             parts.append(self._leakage(state))
         return merge(parts, shift=self._city.origin)
@@ -365,10 +365,10 @@ class RayTracer:
 
     def _by_the_city(self, state: LinkState, found: LegSet) -> PathSet:
         """Line of sight and mirror reflections of the city."""
-        ways = Ways.along(found.legs)
+        scatter_paths = ScatterPaths.along(found.legs)
         return state.paths(
-            ways,
-            found.amplitude * state.elements(self._free.antennas, ways),
+            scatter_paths,
+            found.amplitude * state.elements(self._free.antennas, scatter_paths),
             np.where(found.bounces > 0, PathKind.SPECULAR, PathKind.LINE_OF_SIGHT),
             bounces=found.bounces,
             points=found.legs.points,
@@ -376,13 +376,13 @@ class RayTracer:
         )
 
     def _by_way_of(
-        self, state: LinkState, bodies: dict[str, Pose], legs: dict[Link, LegSet]
+        self, state: LinkState, discs: dict[str, Pose], legs: dict[Link, LegSet]
     ) -> PathSet:
         """Echoes and ghosts of UAVs: every leg to one with every leg from it, up to the bounces
         allowed."""
         most = self._propagation.max_bounces if self._propagation.ghosts else 0
-        sent, heard, sections, numbers = [], [], [], []
-        for name, body in bodies.items():
+        sent, received, sections, numbers = [], [], [], []
+        for name, body in discs.items():
             to, on = legs[Link(state.link.tx, name)], legs[Link(state.link.rx, name)]
             i, j = np.divmod(np.arange(len(to) * len(on)), max(len(on), 1))
             allowed = np.flatnonzero(to.bounces[i] + on.bounces[j] <= most)
@@ -391,17 +391,17 @@ class RayTracer:
             sections.append(self._free.sections[name].square_metres(*aspects))
             numbers.append(np.full(len(to), self._free.names.index(name)))
             sent.append(to)
-            heard.append(on)
-        there, back, target = LegSet.joined(sent), LegSet.joined(heard), np.concatenate(numbers)
+            received.append(on)
+        there, back, target = LegSet.joined(sent), LegSet.joined(received), np.concatenate(numbers)
         a, b, bounces = there.legs, back.legs, there.bounces + back.bounces
         scatter = np.sqrt(4 * np.pi * np.concatenate(sections)) / self._free.wavelength
-        ways = Ways.over(a, b)
-        elements = state.elements(self._free.antennas, ways)
-        places = [body.position for body in bodies.values()]
+        scatter_paths = ScatterPaths.over(a, b)
+        elements = state.elements(self._free.antennas, scatter_paths)
+        places = [body.position for body in discs.values()]
         middle = np.repeat(places, [len(to) for to in sent], axis=0)[:, None]
         chain = [there.faces, np.full((len(there), 1), -1), back.faces[:, ::-1]]
         return state.paths(
-            ways,
+            scatter_paths,
             there.amplitude * back.amplitude * scatter * elements,
             np.where(bounces > 0, PathKind.GHOST, PathKind.TARGET),
             target=target,

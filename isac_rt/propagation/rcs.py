@@ -1,4 +1,4 @@
-"""Radar cross-sections of the swarm's bodies: constant, or 3GPP TR 38.901's UAVs, with a
+"""Radar cross-sections of the swarm's UAVs: constant, or 3GPP TR 38.901's UAVs, with a
 fluctuation that is smooth in aspect."""
 
 from __future__ import annotations

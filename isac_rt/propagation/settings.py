@@ -37,11 +37,11 @@ class Propagation(Node):
     together. More reflections cost time and add weaker paths; the default finds single and double
     ones."""
     rays: Annotated[int, Field(ge=100, le=10_000_000)] = 60_000
-    """Rays that a terminal sends out at each knot of its flight to find which walls a wave may meet
-    one after the other; five knots are pooled (`accuracy.max_untraced_m` says how far apart they
-    are). More rays find paths over small faces more surely and take longer. Paths that are found do
-    not depend on it. The default misses none over the noise of a cell in cities of some hundred
-    metres."""
+    """Rays that a terminal sends out at each time sample of its flight to find which walls a wave
+    may meet one after the other; five time samples are pooled (`accuracy.max_untraced_m` says how
+    far apart they are). More rays find paths over small faces more surely and take longer. Paths
+    that are found do not depend on it. The default misses none over the noise of a cell in cities
+    of some hundred metres."""
     ghosts: bool = True
     """Whether echoes of a target that also bounce off the city are simulated; a receiver takes them
     for targets. On by default, as in any street."""
@@ -49,7 +49,7 @@ class Propagation(Node):
     """How far below the noise of one range-Doppler-antenna cell paths must be to be left out [dB].
     The default leaves out a ten-thousandth of the noise; a smaller value is faster."""
     leakage: Leakage = Leakage()
-    """What a terminal's receiver hears of its own transmitter; it covers what is very near. The
+    """What a terminal's receiver receives of its own transmitter; it covers what is very near. The
     default is that of a board with separate antennas."""
 
 
@@ -99,7 +99,7 @@ class Clutter(Node):
     `field`. The default bounds the number of scatterers beside a wall."""
     mirrors: Annotated[int, Field(ge=0, le=64)] = 0
     """Walls, roofs and grounds per terminal, the strongest, by way of which each scatterer is lit
-    and heard as well, for `field`. 0, the default: clutter of one bounce only."""
+    and received as well, for `field`. 0, the default: clutter of one bounce only."""
 
     @property
     def noise_rise(self) -> float:

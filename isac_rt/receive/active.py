@@ -13,7 +13,7 @@ from isac_rt.receive.clutter_filter import ClutterFilter
 from isac_rt.receive.joint.leakage import without_leakage
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.known import Known
-from isac_rt.receive.sense import Detector, look_at, make_maps
+from isac_rt.receive.sense import Detector, make_maps, measure_channels
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import cleaned
 from isac_rt.receive.types import NO_HINTS, ExpectedClutter, Hints, Reception
@@ -59,14 +59,14 @@ class ActiveReceiver:
             if alone is not cube.samples:
                 moments = Moments(alone, known)
             detections = self.refiner(moments, detections)[0]
-        picture = make_maps(found.power, cube, self.settings, 2) if maps else None
+        kept_maps = make_maps(found.power, cube, self.settings, 2) if maps else None
         out = Reception.undecoded(
-            cube.waveform, detections, picture, found.sparse, found.correction
+            cube.waveform, detections, kept_maps, found.sparse, found.correction
         )
         if self.settings.self_calibration == "none":
             return out
-        looks = look_at(spectra, known, found.estimates, found.detections.snr)
-        return replace(out, looks=looks, neighbours=found.neighbours)
+        measured = measure_channels(spectra, known, found.estimates, found.detections.snr)
+        return replace(out, path_channels=measured, neighbours=found.neighbours)
 
 
 def receive_active(

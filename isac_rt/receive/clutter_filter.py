@@ -50,7 +50,7 @@ class ClutterFilter:
                 codes / codes.shape[1]
             ).astype(np.complex64)
             return
-        remove_standing(spectra, schedule, self.least)
+        remove_static(spectra, schedule, self.least)
 
 
 def occupied_factor(looks: float) -> float:
@@ -94,7 +94,7 @@ def _in_runs(occupied: np.ndarray, least: int) -> np.ndarray:
     return inside[:, MARGIN : MARGIN + occupied.shape[1]]
 
 
-def remove_standing(spectra: np.ndarray, schedule: Schedule, least: int | None) -> np.ndarray:
+def remove_static(spectra: np.ndarray, schedule: Schedule, least: int | None) -> np.ndarray:
     """Subtract in place, from every range cell in a run, the mean over the chirps of each antenna
     and group.
 

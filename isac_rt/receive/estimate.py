@@ -92,7 +92,7 @@ class LocalSpectra:
         low, count = _rows_about(row, spectra.shape[2])
         self._axis = _axis(known.waveform)._replace(first=float(low))
         self._num_rx = spectra.shape[1]
-        self._chirps = _room(self._sent, self._num_rx, count)
+        self._chirps = _workspace(self._sent, self._num_rx, count)
         gather(np.ascontiguousarray(spectra), low, self._axis.share, self._chirps)
 
     def _matched(self, delays: np.ndarray, delay_rates: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -117,7 +117,7 @@ class LocalSpectra:
         c, a = self._chirps, self._axis
         size, rows = c.tx.size, c.rows
         data = c.data.reshape(size, rows, c.blocks, 2, LANES)
-        heard = (data[:, :, :, 0] + 1j * data[:, :, :, 1]).reshape(size, rows, -1)
+        received = (data[:, :, :, 0] + 1j * data[:, :, :, 1]).reshape(size, rows, -1)
         w, time = self.waveform, c.time[:size]
         beat = w.beat_cells(delay, delay_rate, time)
         near = (beat - a.first)[:, None] - np.arange(rows)
@@ -132,7 +132,7 @@ class LocalSpectra:
             weighted = (template * np.repeat(weight[sent], rows)).conj()
             energy, found = (
                 weighted @ template.T,
-                weighted @ heard[sent].reshape(-1, heard.shape[2]),
+                weighted @ received[sent].reshape(-1, received.shape[2]),
             )
             out[:, antenna] = np.linalg.solve(energy, found[:, : self._num_rx])
         return out
@@ -222,7 +222,7 @@ def _amplitudes(matched: np.ndarray, energy: np.ndarray, num_tx: int) -> np.ndar
     return np.asarray((sets * turn).mean(axis=1))
 
 
-def _room(sent: _Sent, num_rx: int, rows: int) -> Chirps:
+def _workspace(sent: _Sent, num_rx: int, rows: int) -> Chirps:
     """Without samples yet."""
     weight, time, tx, _ = sent
     blocks = -(-num_rx // LANES)
@@ -370,8 +370,8 @@ def estimate(
     `LocalSpectra.climb`, and add the matches there to `out` and `energy` (`match`)."""
     lanes, num_tx = 2 * LANES * chirps.blocks, energy.shape[1]
     for q, (low, count) in enumerate(zip(lows.tolist(), counts.tolist(), strict=True)):
-        room = chirps.data[: chirps.tx.size * count * lanes]
-        here, about = chirps._replace(data=room, rows=count), axis._replace(first=float(low))
+        workspace = chirps.data[: chirps.tx.size * count * lanes]
+        here, about = chirps._replace(data=workspace, rows=count), axis._replace(first=float(low))
         gather(spectra, low, axis.share, here)
 
         def explained(
@@ -414,7 +414,7 @@ class Estimator:
         w, sent, num_rx = known.waveform, _sent(known, separate), spectra.shape[1]
         (delays, rates), steps = self._start(power, rows, columns, w)
         lows, counts = _rows_about(np.asarray(rows, np.int64), spectra.shape[2])
-        chirps = _room(sent, num_rx, 2 * HALF_WIDTH + 1)
+        chirps = _workspace(sent, num_rx, 2 * HALF_WIDTH + 1)
         energy = np.zeros((len(rows), sent.antennas))
         out = np.zeros((len(rows), sent.antennas * chirps.blocks * 2 * LANES), np.float32)
         peaks = lows, counts, delays, rates
@@ -559,16 +559,16 @@ def excess(
     some = _within(u)
     if free == known.channels or not some.any():
         return out
-    heard, radius = channels[some], known.radius(delays[some])[:, None]
+    received, radius = channels[some], known.radius(delays[some])[:, None]
     turn = 2j * np.pi * known.waveform.effective_carrier
     to, fro = (
         np.exp(turn * element_delays(places, u[some], radius)[0]).conj() / len(places)
         for places in (a.tx_positions, a.rx_positions)
     )
-    waves = (heard * fro[:, None]).sum(axis=2)
+    waves = (received * fro[:, None]).sum(axis=2)
     if known.passes == 2:
         waves = (waves * to).sum(axis=1, keepdims=True)
-    total = (np.abs(heard) ** 2).mean(axis=(1, 2))
+    total = (np.abs(received) ** 2).mean(axis=(1, 2))
     wave = (np.abs(waves) ** 2).mean(axis=1)
     left = (total - wave) / (1 - free / known.channels)
     beyond = np.maximum(left - total / np.maximum(snr[some], 1.0), 0.0)

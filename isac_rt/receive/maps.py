@@ -72,9 +72,9 @@ def _mapped(spectra: np.ndarray, known: Known, maps: np.ndarray) -> np.ndarray:
     ends, places, factors = _operators(known)
     places = 2 * (places[0] * np.uint64(spectra[0].size) + places[1])
     flat = np.ascontiguousarray(spectra).reshape(-1).view(np.float32)
-    room = aligned(4 * ROWS * len(factors) * PART)
-    spare = np.empty((ROWS, spectra.shape[3]), np.complex64)
-    make_maps(flat, spectra.shape, ends, places, factors, room, maps, spare, power)
+    workspace = aligned(4 * ROWS * len(factors) * PART)
+    buffer = np.empty((ROWS, spectra.shape[3]), np.complex64)
+    make_maps(flat, spectra.shape, ends, places, factors, workspace, maps, buffer, power)
     return np.fft.fftshift(power, axes=-1) / (known.waveform.num_tx * spectra.shape[1])
 
 
@@ -172,16 +172,16 @@ def make_maps(
     ends: np.ndarray,
     places: np.ndarray,
     factors: np.ndarray,
-    room: np.ndarray,
+    workspace: np.ndarray,
     maps: np.ndarray,
-    spare: np.ndarray,
+    buffer: np.ndarray,
     power: np.ndarray,
 ) -> None:
     """Add the power of all virtual channels to power (rows, P), FFT order, and write maps (L_tx,
     L_rx, rows, P) unless there are none.
 
     `flat` are the real and imaginary parts of samples of `shape`, `places` say where chirps stand
-    in them; `factors` see `_operators`. `room` and `spare` are work space.
+    in them; `factors` see `_operators`. `workspace` and `buffer` are work space.
     """
     num_rx, num_rows, num_chirps = shape[1:]
     samples = flat.view(np.complex64)

@@ -16,7 +16,7 @@ from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.joint.neighbours import separate
 from isac_rt.receive.joint.tones import JointPath
 from isac_rt.receive.known import Known
-from isac_rt.receive.sense import Cfar, Sensed, describe, look_at, make_maps
+from isac_rt.receive.sense import Cfar, Sensed, describe, make_maps, measure_channels
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import cleaned
 from isac_rt.receive.symbols.phases import decide_phases
@@ -33,7 +33,7 @@ from isac_rt.receive.types import (
     NO_HINTS,
     Detections,
     Hints,
-    Look,
+    PathChannels,
     Prediction,
     Reception,
     no_detections,
@@ -103,7 +103,9 @@ class PassiveReceiver:
             moments = Moments(cube.samples, known)
             found = self.detector.sense(spectra, known, hints)
             detections, reference = self._earliest(found, known)
-            found = replace(found, looks=self._look(spectra, known, detections, reference))
+            found = replace(
+                found, path_channels=self._measure_channels(spectra, known, detections, reference)
+            )
             detections, reference = self._alone(moments, detections, reference)
             return self._reception(cube, moments, found, detections, reference, maps=maps)
         symbols = None
@@ -111,8 +113,8 @@ class PassiveReceiver:
             symbols = self.reader.read(cube, prediction, self.antennas)
         if prediction is None or symbols is None or not self._believed(symbols, w):
             power = np.zeros((w.num_range_cells, w.num_chirps))
-            picture = make_maps(power, cube, self.settings, 1) if maps else None
-            return Reception.undecoded(w, no_detections(), picture)
+            kept_maps = make_maps(power, cube, self.settings, 1) if maps else None
+            return Reception.undecoded(w, no_detections(), kept_maps)
         read = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
         spectra, known = cleaned(cube, read)
         moments = Moments(cube.samples, known)
@@ -199,20 +201,24 @@ class PassiveReceiver:
         known = moments.known
         found = self.detector.sense(spectra, known, hints)
         detections, reference = self._at_prediction(spectra, known, found, prediction)
-        found = replace(found, looks=self._look(spectra, known, detections, reference))
+        found = replace(
+            found, path_channels=self._measure_channels(spectra, known, detections, reference)
+        )
         return found, *self._alone(moments, detections, reference)
 
-    def _look(
+    def _measure_channels(
         self,
         spectra: np.ndarray,
         known: Known,
         detections: Detections,
         reference: Estimate | None,
-    ) -> tuple[Look, ...]:
+    ) -> tuple[PathChannels, ...]:
         """Return the channels as the reference shows them, where that is asked for."""
         if reference is None or self.settings.self_calibration == "none":
             return ()
-        return look_at(spectra, known, [reference], detections.snr[detections.is_reference])
+        return measure_channels(
+            spectra, known, [reference], detections.snr[detections.is_reference]
+        )
 
     def _alone(
         self, moments: Moments, detections: Detections, reference: Estimate | None
@@ -281,11 +287,13 @@ class PassiveReceiver:
         maps: bool,
     ) -> Reception:
         """Return the refined detections, without the symbols."""
-        picture = make_maps(found.power, cube, self.settings, 1) if maps else None
-        out = Reception.undecoded(cube.waveform, detections, picture, found.sparse)
+        kept_maps = make_maps(found.power, cube, self.settings, 1) if maps else None
+        out = Reception.undecoded(cube.waveform, detections, kept_maps, found.sparse)
         if reference is not None:
             level = _power(reference)
-            out = replace(out, line_of_sight=True, reference_power=level, looks=found.looks)
+            out = replace(
+                out, line_of_sight=True, reference_power=level, path_channels=found.path_channels
+            )
         if self.refiner is None:
             return out
         detections, power = self.refiner(moments, detections)

@@ -45,7 +45,7 @@ def channels_of(antennas: Antennas, passes: int) -> Channels:
 
 
 @lru_cache(maxsize=16)
-def looks_of(antennas: Antennas, passes: int, wavenumber: float) -> np.ndarray:
+def steering_directions(antennas: Antennas, passes: int, wavenumber: float) -> np.ndarray:
     """(K, axes) direction cosines that the scan looks at, all within the field of view."""
     places, axes = channels_of(antennas, passes)
     limit = antennas.view_limit
@@ -66,13 +66,13 @@ def _steering(looks: np.ndarray, places: np.ndarray, wavenumber: float) -> np.nd
 def _kept(antennas: Antennas, passes: int, wavenumber: float) -> np.ndarray:
     """Steering (K, L) of all looks."""
     places = channels_of(antennas, passes).places
-    return _steering(looks_of(antennas, passes, wavenumber), places, wavenumber)
+    return _steering(steering_directions(antennas, passes, wavenumber), places, wavenumber)
 
 
 def scan(values: np.ndarray, known: Known) -> np.ndarray:
     """(axes,) direction cosines of the strongest look at channels (L, sums)."""
     key = known.antennas, known.passes, known.wavenumber
-    looks, values = looks_of(*key), values.astype(np.complex64)
+    looks, values = steering_directions(*key), values.astype(np.complex64)
     if looks.shape[0] * values.shape[0] <= MOST_KEPT:
         beams = _kept(*key) @ values
         return looks[int((np.abs(beams) ** 2).sum(axis=1).argmax())]

@@ -96,7 +96,7 @@ class _Path:
     snr: float
     rows: tuple[int, int] = (0, 0)
     sent: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    heard: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    received: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 def pursue(
@@ -292,7 +292,7 @@ def _take_out(spectra: np.ndarray, path: _Path, known: Known, noise: float) -> N
     reach = int(min(np.ceil(lobe) + 3, FARTHEST_REACH))
     path.rows = max(middle - reach, 0), min(middle + reach + 1, spectra.shape[2])
     direction = np.nan_to_num(direction_cosines(e, known))
-    path.heard, path.sent = (
+    path.received, path.sent = (
         element_delays(positions, direction, known.radius(e.delay))[0] / w.delay_step
         for positions in (known.antennas.rx_positions, known.antennas.tx_positions)
     )
@@ -312,7 +312,7 @@ def _add(spectra: np.ndarray, path: _Path, known: Known, sign: float) -> None:
         w.beat_cells(e.delay, e.delay_rate, known.times),
         np.exp(2j * np.pi * cycles),
         path.sent,
-        path.heard,
+        path.received,
         (float(w.window_length), float(w.num_samples)),
     )
 
@@ -326,12 +326,12 @@ def add_template(
     beat: np.ndarray,
     turn: np.ndarray,
     sent: np.ndarray,
-    heard: np.ndarray,
+    received: np.ndarray,
     window: tuple[float, float],
 ) -> None:
     """Add a path's template in place.
 
-    spectra[m, rx, i, p] += channels[tx, rx] turn[m, p] h(beat + sent + heard - i) exp(-j pi i
+    spectra[m, rx, i, p] += channels[tx, rx] turn[m, p] h(beat + sent + received - i) exp(-j pi i
     length / size), tx the antenna of the chirp, for i in [*rows), h the transform of the window
     (`hann_response`) of `window` length and size [samples].
     """
@@ -339,7 +339,7 @@ def add_template(
     row, share = np.arange(*rows)[:, None], length / size
     back = np.exp(-1j * np.pi * share * row)
     for rx in range(spectra.shape[1]):
-        place = (beat + sent[schedule] + heard[rx])[:, None]
+        place = (beat + sent[schedule] + received[rx])[:, None]
         d = (place - row) * share
         hole = np.abs(np.abs(d) - 1) < 1e-6
         safe = np.where(hole, 0.5, d)

@@ -32,7 +32,15 @@ from isac_rt.receive.maps import (
 )
 from isac_rt.receive.omp import Omp, advise
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import NO_HINTS, Correction, Detections, Hints, Look, Maps, Neighbours
+from isac_rt.receive.types import (
+    NO_HINTS,
+    Correction,
+    Detections,
+    Hints,
+    Maps,
+    Neighbours,
+    PathChannels,
+)
 
 MIXED = 0.1
 """Power of other paths over its own from which a detection starts no track, beside what noise
@@ -45,7 +53,7 @@ MOST_LOOKS = 24
 @dataclass(frozen=True)
 class Sensed:
     """Detections of a frame with their estimates, strongest first, the map that they came from and
-    its background (`CfarRule.detect`). `sparse`, `correction`, `looks`, `neighbours`: see
+    its background (`CfarRule.detect`). `sparse`, `correction`, `path_channels`, `neighbours`: see
     `Reception`."""
 
     estimates: list[Estimate]
@@ -54,7 +62,7 @@ class Sensed:
     level: np.ndarray
     sparse: bool | None = None
     correction: Correction | None = None
-    looks: tuple[Look, ...] = ()
+    path_channels: tuple[PathChannels, ...] = ()
     neighbours: Neighbours | None = None
 
 
@@ -140,9 +148,9 @@ def window_gain(known: Known) -> float:
     return float((slow_window(w) ** 2).sum()) * len(known.schedule) / w.num_tx
 
 
-def look_at(
+def measure_channels(
     spectra: np.ndarray, known: Known, estimates: Sequence[Estimate], snr: np.ndarray
-) -> tuple[Look, ...]:
+) -> tuple[PathChannels, ...]:
     """Return the channels as the `MOST_LOOKS` strongest of the paths show them."""
     out = []
     for i in np.argsort(snr)[::-1][:MOST_LOOKS]:
@@ -150,7 +158,7 @@ def look_at(
         row = round(float(known.waveform.beat_cells(delay, rate, 0.0)))
         if 0 <= row < spectra.shape[2] and (known.full or known.passes == 1):
             modes = LocalSpectra(spectra, known, row).modes(delay, rate)
-            out.append(Look(delay, rate, modes, float(snr[i])))
+            out.append(PathChannels(delay, rate, modes, float(snr[i])))
     return tuple(out)
 
 

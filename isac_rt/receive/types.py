@@ -149,7 +149,7 @@ class Maps:
 
 
 @dataclass(frozen=True)
-class Look:
+class PathChannels:
     """Channels as one strong path shows them.
 
     Attributes
@@ -217,7 +217,7 @@ class Reception:
         terminal expects; None where a detector does not ask
     placed : whether what it shows can be placed: not where data were read over a path that nothing
         explains
-    looks : what strong paths show of the channels, at a PT its reference alone; empty where
+    path_channels : what strong paths show of the channels, at a PT its reference alone; empty where
         `receivers.self_calibration` is none
     neighbours : what clutter shows of the channels; None where nobody asks, or the detector does
         not know the mesh
@@ -238,7 +238,7 @@ class Reception:
     confidence_looks: int = 0
     sparse: bool | None = None
     correction: Correction | None = None
-    looks: tuple[Look, ...] = ()
+    path_channels: tuple[PathChannels, ...] = ()
     neighbours: Neighbours | None = None
     placed: bool = True
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from isac_rt.propagation.pathset import PathSet
 from isac_rt.results.metrics import SymbolCount
-from isac_rt.results.records import KINDS, FrameRecord, ObserverRecord, PictureRecord, Use
+from isac_rt.results.records import KINDS, FrameRecord, FusedRecord, ObserverRecord, Use
 
 DIMENSIONLESS = "1"
 COMPONENTS = ("x", "y", "z", "v_x", "v_y", "v_z")
@@ -298,7 +298,7 @@ DETECTIONS: dict[str, Column] = {
         np.int32,
     ),
     "skirt": _number(
-        "the path that explains it lies more than a cell away", "detection_skirt", bool
+        "the path that explains it lies more than a cell away", "detection_sidelobe", bool
     ),
 }
 TRACKS: dict[str, Column] = {
@@ -334,7 +334,7 @@ TRACKS: dict[str, Column] = {
 }
 
 
-def _of_picture(name: str, column: int) -> Callable[[PictureRecord], np.ndarray]:
+def _of_fused(name: str, column: int) -> Callable[[FusedRecord], np.ndarray]:
     return lambda p: getattr(p, name)[:, column]
 
 
@@ -386,7 +386,7 @@ FUSED: dict[str, Column] = {
             float,
             units,
             f"{meaning} {axis} of the {what}",
-            _of_picture(source, 3 * rate + i),
+            _of_fused(source, 3 * rate + i),
         )
         for source, suffix, meaning in (("mean", "", "world"), ("std", "_std", "deviation of"))
         for rate, (word, units, what) in enumerate(
@@ -400,7 +400,7 @@ FUSED: dict[str, Column] = {
     ),
     "uav": _number("index of the target that it is found as, -1: none", "uav", np.int16),
 }
-"""Bodies of the pictures."""
+"""UAVs of the set of fused tracks."""
 
 
 def _power_db(p: PathSet) -> np.ndarray:

@@ -65,8 +65,8 @@ def tracked_states(dataset: xr.Dataset) -> np.ndarray:
 
 
 def fused_positions(dataset: xr.Dataset, frame: int, picture: str) -> np.ndarray:
-    """(B, 3) where the picture of a terminal, or of the swarm, has bodies that are no terminals
-    [m]; none where terminals do not cooperate."""
+    """(B, 3) where the set of fused tracks of a terminal, or of the swarm, has UAVs that are no
+    terminals [m]; none where terminals do not cooperate."""
     if "picture" not in dataset.variables:
         return np.zeros((0, 3))
     mine = (
@@ -125,7 +125,7 @@ def row_of(record: FrameRecord) -> Row:
         "frame": rows("frame", {"": record}),
         **{kind: rows(kind, record.observers) for kind in ("observer", "det", "track")},
         "use": rows("use", record.uses),
-        **{kind: rows(kind, record.pictures) for kind in ("picture", "fused")},
+        **{kind: rows(kind, record.fused_records) for kind in ("picture", "fused")},
     }
     for label, o in record.observers.items() if record.snapshot else ():
         lookup = np.array([uavs.index(name) for name in o.paths.target_names] + [-1])
@@ -201,7 +201,7 @@ def dataset_of(
     }
     _put_paths(put, found["path"])
     _put_maps(put, found["maps"], len(labels))
-    _put_pictures(put, tables, sizes)
+    _put_fused(put, tables, sizes)
     numbers = {
         "carrier_hz": w.carrier_frequency,
         "effective_carrier_hz": w.effective_carrier,
@@ -270,8 +270,8 @@ def _put_paths(put: Callable[..., None], found: Sequence[tuple[int, int, Columns
         put(f"path_{name}", ["path", *column.dims], values, column.units, column.meaning)
 
 
-def _put_pictures(put: Callable[..., None], tables: Tables, sizes: Mapping[str, int]) -> None:
-    """The pictures of terminals that cooperate; nothing where none does."""
+def _put_fused(put: Callable[..., None], tables: Tables, sizes: Mapping[str, int]) -> None:
+    """The set of fused tracks of terminals that cooperate; nothing where none does."""
     names = list(tables["picture"])
     if not names:
         return
@@ -312,6 +312,6 @@ def _put_maps(
         return out
 
     for name, source, dtype, dims, units, meaning in MAPS:
-        pictures = len(dims) > 1
-        along = ["snapshot", "observer", *dims] if pictures else ["observer", *dims]
-        put(name, along, padded(source, dtype, pictures), units, meaning)
+        wide = len(dims) > 1
+        along = ["snapshot", "observer", *dims] if wide else ["observer", *dims]
+        put(name, along, padded(source, dtype, wide), units, meaning)

@@ -26,14 +26,14 @@ class Explanation(NamedTuple):
     target : (Q,) int16 index into the set's target names, -1 also where no UAV is involved
     order : (Q,) int16 interactions with the city, 0 of a direct path
     face : (Q,) int32 face of the city's mesh that the path meets first, -1 also where it meets none
-    skirt : (Q,) bool, the path lies more than a cell away: the detection is in its skirt
+    sidelobe : (Q,) bool, the path lies more than a cell away: the detection is in its skirt
     """
 
     kind: np.ndarray
     target: np.ndarray
     order: np.ndarray
     face: np.ndarray
-    skirt: np.ndarray
+    sidelobe: np.ndarray
 
 
 def owners(kind: np.ndarray, target: np.ndarray, paths: PathSet, names: list[str]) -> np.ndarray:

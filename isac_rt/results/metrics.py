@@ -21,7 +21,7 @@ class Truth(NamedTuple):
     """One UAV as one terminal ought to see it.
 
     range [m] and velocity [m/s, positive receding] in the terms of `Detections`; direction cosines
-    u_x, u_z; azimuth from the boresight towards +X and elevation from the horizontal of the body
+    u_x, u_z; azimuth from the boresight towards +X and elevation from the horizontal of the UAV
     [rad]
     """
 

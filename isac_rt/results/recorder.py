@@ -59,7 +59,7 @@ class Figures:
         wall seconds of stages and total (`TIMINGS`)
     plan : what was modelled: the summary's `fidelity`, but for what was kept of the paths
     access : what became of the stages before the data, None without them
-    compared : `Recorder.blocks` of the sets of receivers that heard the same samples, by name
+    compared : `Recorder.blocks` of the sets of receivers that received the same samples, by name
     costs : of each set, `OWN` included, the processor seconds of reception and tracking by link;
         empty without sets to compare
     """
@@ -195,9 +195,9 @@ class Recorder:
             if len(self)
             else 0.0
         )
-        heard = {link: self._of(link) for link in timetable.all_links}
-        symbols = {link: _symbols(link, rows) for link, rows in heard.items()}
-        seen = {link: self._sensing(link, rows) for link, rows in heard.items()}
+        by_link = {link: self._of(link) for link in timetable.all_links}
+        symbols = {link: _symbols(link, rows) for link, rows in by_link.items()}
+        seen = {link: self._sensing(link, rows) for link, rows in by_link.items()}
 
         def block(
             role: str | list[str], links: list[Link], symbols: SymbolCount | None
@@ -205,7 +205,7 @@ class Recorder:
             sensing, names = Sensing.pooled([seen[link] for link in links]), timetable.first_roles
             others = {u: t for u, t in sensing.targets(list(names)).items() if u != links[0].rx}
             found = summary_block(role, sensing, symbols, duration)
-            waits = [n for link in links for n in heard[link]["latency_frames"].tolist()]
+            waits = [n for link in links for n in by_link[link]["latency_frames"].tolist()]
             return found | {"latency_frames": latencies(symbols, waits), "targets": others}
 
         terminals = {}
@@ -222,22 +222,22 @@ class Recorder:
             str(link): block("active" if link.own else "passive", [link], counted)
             for link, counted in symbols.items()
         }
-        pictures = {
+        fused_records = {
             name: (table.whole(), self.tables["fused"][name].whole())
             for name, table in self.tables["picture"].items()
         }
-        swarm = summary_of(pictures, list(timetable.first_roles))
+        swarm = summary_of(fused_records, list(timetable.first_roles))
         return {"terminals": terminals, "links": links, "swarm": swarm}
 
     def _of(self, link: Link) -> np.ndarray:
         """The rows of a link's receiver."""
         return self.tables["observer"][self.timetable.labels[link]].whole()
 
-    def _sensing(self, link: Link, heard: np.ndarray) -> Sensing:
+    def _sensing(self, link: Link, by_link: np.ndarray) -> Sensing:
         """Summarise the sensing of a link's receiver from its rows."""
         label = self.timetable.labels[link]
         frames, tracks = self.tables["observer"][label].frames(), self.tables["track"][label]
-        return Sensing.of(heard, tracks.whole(), np.searchsorted(frames, tracks.frames()))
+        return Sensing.of(by_link, tracks.whole(), np.searchsorted(frames, tracks.frames()))
 
     def _sparsity(self, link: Link) -> dict[str, int] | None:
         """Frames whose receiver judged how sparse the scene is, those found dense, and those sent
@@ -250,9 +250,9 @@ class Recorder:
         return {"judged": len(judged), "dense": dense, "fell_back": fell_back}
 
 
-def _symbols(link: Link, heard: np.ndarray) -> SymbolCount | None:
+def _symbols(link: Link, by_link: np.ndarray) -> SymbolCount | None:
     """Summarise the symbols of a link by its receiver's rows; None for own echoes."""
-    return None if link.own else SymbolCount(*heard["symbols"].sum(axis=0).tolist())
+    return None if link.own else SymbolCount(*by_link["symbols"].sum(axis=0).tolist())
 
 
 def kept_of_paths(use: Columns) -> dict[str, Any]:

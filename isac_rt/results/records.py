@@ -89,9 +89,9 @@ class ObserverRecord:
         likewise
     gospa : of the confirmed tracks against the UAVs in view and unshadowed
     gospa_targets : the same without terminals and the tracks that their own paths feed
-    detection_kind, detection_target, detection_order, detection_face, detection_skirt : (Q,) what
-        explains each detection, as `isac_rt.results.labels.Explanation` says, targets as indices
-        of UAVs
+    detection_kind, detection_target, detection_order, detection_face, detection_sidelobe : (Q,)
+        what explains each detection, as `isac_rt.results.labels.Explanation` says, targets as
+        indices of UAVs
     symbols : what was sent to it and became of it
     latency : frames after which its data were read, -1: they were not
     fell_back : whether the transmitter sent the conventional schedule in place of the scenario's
@@ -127,7 +127,7 @@ class ObserverRecord:
     detection_target: np.ndarray
     detection_order: np.ndarray
     detection_face: np.ndarray
-    detection_skirt: np.ndarray
+    detection_sidelobe: np.ndarray
     symbols: SymbolCount = field(default_factory=SymbolCount)
     latency: int = -1
     fell_back: bool = False
@@ -156,20 +156,20 @@ class LateRecord:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PictureRecord:
-    """One picture of a frame: of a terminal, or of all together. B bodies, U UAVs.
+class FusedRecord:
+    """One set of fused tracks of a frame: of a terminal, or of all together. B UAVs, U UAVs.
 
     Attributes
     ----------
-    gospa : (3,) localisation, missed, false [m^2], over targets in view of anyone and bodies that
+    gospa : (3,) localisation, missed, false [m^2], over targets in view of anyone and UAVs that
         are nobody's of the swarm
     seen, found : (U,) bool; a target in view of a link's receiver when it last received; one that a
         body stands for which the target's own echo feeds
     error : (U, 3) of those found: position [m], velocity [m/s], squared error of position in the
         deviations stated over its axes
-    false, hidden, unrecognised : bodies that stand for nobody, for a target in nobody's view, and
+    false, hidden, unrecognised : UAVs that stand for nobody, for a target in nobody's view, and
         for a terminal that is not recognised
-    reports, age : what was heard from others and counts, and its mean age [s]
+    reports, age : what was received from others and counts, and its mean age [s]
     messages, lost : that reached the terminal in this frame, and those of them that were lost
     late : earlier ones, lost until then, that came with a frame that was read late
     bits, room : of these messages, and that the ways to the terminal had in this frame
@@ -247,7 +247,7 @@ class FrameRecord:
     snapshot : whether the whole path ledger and the maps are kept
     uses : what was kept of the paths of each link
     dropped : traced paths that the float64 geometry contradicted
-    pictures : of the terminals and of all together by name, where terminals cooperate
+    fused_records : of the terminals and of all together by name, where terminals cooperate
     """
 
     frame: int
@@ -258,4 +258,4 @@ class FrameRecord:
     snapshot: bool = False
     uses: Mapping[Link, Use] = field(default_factory=dict)
     dropped: int = 0
-    pictures: Mapping[str, PictureRecord] = field(default_factory=dict)
+    fused_records: Mapping[str, FusedRecord] = field(default_factory=dict)

@@ -44,7 +44,7 @@ MISREAD = 0.5
 
 
 @dataclass(frozen=True)
-class Heard:
+class LinkResult:
     """Outcome of one frame at a terminal: reception, tracks and the state it is in then
     (`TerminalState`), and the earlier frames that it made readable."""
 
@@ -84,7 +84,12 @@ class Scorer(Stateful):
         self.state = Remembered()
 
     def record(
-        self, frame: int, paths: PathSet, sent: Transmission, heard: Heard, noise_power: float
+        self,
+        frame: int,
+        paths: PathSet,
+        sent: Transmission,
+        received: LinkResult,
+        noise_power: float,
     ) -> ObserverRecord:
         """Score one frame and describe it.
 
@@ -93,10 +98,10 @@ class Scorer(Stateful):
         frame : its number
         paths : from the link's transmitter, as they were synthesised
         sent : what that transmitter sent
-        heard : what the receiver made of it
+        received : what the receiver made of it
         noise_power : per sample at the receiver [W]
         """
-        reception, timetable, tracks = heard.reception, self._timetable, heard.tracks
+        reception, timetable, tracks = received.reception, self._timetable, received.tracks
         view = self._view(frame, paths)
         sees = self._sensitivity(frame, sent, noise_power)
         labels = self._labels_of(reception.detections, paths, sees, view.directions)
@@ -126,7 +131,7 @@ class Scorer(Stateful):
             in_view=view.inside,
             shadowed=view.inside & ~view.direct,
             tracks=table,
-            state=heard.state,
+            state=received.state,
             hit=hit,
             loss=loss,
             bound=self._bound(view, chances),
@@ -153,11 +158,11 @@ class Scorer(Stateful):
             reference_snr=_reference_snr(paths, sent.amplitude, noise_power),
         )
 
-    def late(self, frame: int, heard: Heard) -> list[LateRecord]:
+    def late(self, frame: int, received: LinkResult) -> list[LateRecord]:
         """Return the records of earlier frames that frame number `frame` made readable."""
         timetable, tx = self._timetable, self.link.tx
         records = []
-        for one in heard.late:
+        for one in received.late:
             since = one.time - timetable.epoch(0, tx)
             number = round(since / timetable.interval)
             payload, groups = timetable.payload(tx, number), timetable.groups(self.link)
@@ -213,7 +218,7 @@ class Scorer(Stateful):
         index = np.array([names.index(name) for name in paths.target_names] + [-1], np.int16)
         return _Labels(
             **found._replace(target=index[found.target])._asdict(),
-            uav=np.where(found.skirt, -1, uav),
+            uav=np.where(found.sidelobe, -1, uav),
         )
 
     def _off(self, truth: Truth, points: np.ndarray) -> np.ndarray:
@@ -331,7 +336,7 @@ class _Labels:
     target: np.ndarray
     order: np.ndarray
     face: np.ndarray
-    skirt: np.ndarray
+    sidelobe: np.ndarray
     uav: np.ndarray
 
 

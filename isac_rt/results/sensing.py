@@ -133,7 +133,7 @@ class Sensing:
         return Sensing(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
     def block(self) -> dict[str, Any]:
-        """The keys of a terminal or link in `summary.json` that are of its picture."""
+        """The keys of a terminal or link in `summary.json` that are of its fused tracks."""
         frames, in_view = len(self.seen), int(self.seen.sum())
         found = np.isfinite(self.detected[..., 0]) & self.seen
         followed = np.isfinite(self.tracked[..., 0]) & self.seen
@@ -218,7 +218,7 @@ def gospa_block(parts: np.ndarray, seen: np.ndarray) -> dict[str, float | None]:
     Parameters
     ----------
     parts : (F, 3) localisation, missed, false [m^2]
-    seen : (F, U) bool, what ought to be in the picture
+    seen : (F, U) bool, what ought to be in the set of fused tracks
     """
     if not len(parts):
         return dict.fromkeys(("total_m", "missed", "false", "localisation_m", "empty_m"))

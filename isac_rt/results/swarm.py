@@ -19,13 +19,14 @@ from isac_rt.plain import Stateful
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.results.dataset import Columns
 from isac_rt.results.metrics import GOSPA_CUTOFF_M
-from isac_rt.results.records import ObserverRecord, PictureRecord
+from isac_rt.results.records import FusedRecord, ObserverRecord
 from isac_rt.results.sensing import gospa_block
 from isac_rt.track.fused import Fused, Key
 from isac_rt.world.swarm import Pose
 
 SWARM = "swarm"
-"""The picture of all terminals together; a terminal of this name has none of its own."""
+"""The set of fused tracks of all terminals together; a terminal of this name has none of its
+own."""
 
 
 @dataclass(frozen=True)
@@ -54,18 +55,18 @@ class Traffic:
 
 @dataclass(frozen=True)
 class View:
-    """A picture after a frame.
+    """A set of fused tracks after a frame.
 
     Attributes
     ----------
     time : that it is of [s]
-    bodies : in it
+    fused : its tracks
     ages : of the reports from others that it rests on [s]
     traffic : messages to the terminal
     """
 
     time: float
-    bodies: tuple[Fused, ...]
+    fused: tuple[Fused, ...]
     ages: tuple[float, ...] = ()
     traffic: Traffic = Traffic()
 
@@ -79,8 +80,8 @@ class Remembered:
 
 
 class SwarmScorer(Stateful):
-    """Holds pictures against the truth. It remembers which UAVs each link saw last, and what fed
-    each track last."""
+    """Holds fused tracks against the truth. It remembers which UAVs each link saw last, and what
+    fed each track last."""
 
     def __init__(self, timetable: Timetable) -> None:
         self._timetable = timetable
@@ -93,8 +94,8 @@ class SwarmScorer(Stateful):
         views: Mapping[str, View],
         observers: Mapping[Link, ObserverRecord],
         poses: Mapping[str, Mapping[str, Pose]],
-    ) -> dict[str, PictureRecord]:
-        """Score a frame's pictures.
+    ) -> dict[str, FusedRecord]:
+        """Score a frame's fused tracks.
 
         Parameters
         ----------
@@ -116,8 +117,8 @@ class SwarmScorer(Stateful):
 
     def _score(
         self, view: View, seen: np.ndarray, target: np.ndarray, poses: Mapping[str, Pose]
-    ) -> PictureRecord:
-        names, bodies = list(poses), view.bodies
+    ) -> FusedRecord:
+        names, bodies = list(poses), view.fused
         truth = np.array([np.concatenate([p.position, p.velocity]) for p in poses.values()])
         mean = np.array([b.state.mean for b in bodies]).reshape(-1, 6)
         covariance = np.array([b.state.covariance for b in bodies]).reshape(-1, 6, 6)
@@ -138,7 +139,7 @@ class SwarmScorer(Stateful):
             if any(self.state.fed.get(key) == u for key in bodies[k].members):
                 follows[k] = u
                 error[u] = _errors(bodies[k], truth[u])
-        return PictureRecord(
+        return FusedRecord(
             gospa=np.array(
                 [
                     sum(nearest[k, u] ** 2 for u, k in stands.items()),
@@ -187,29 +188,30 @@ def _errors(body: Fused, truth: np.ndarray) -> tuple[float, float, float]:
 
 
 def summary_of(
-    pictures: Mapping[str, tuple[Columns, Columns]], names: Sequence[str]
+    fused_records: Mapping[str, tuple[Columns, Columns]], names: Sequence[str]
 ) -> dict[str, Any] | None:
-    """The key `swarm` of the summary: the picture of all terminals together, and under `terminals`
-    that of each (`docs/outputs.md` says what each figure means); None without pictures.
+    """The key `swarm` of the summary: the set of fused tracks of all terminals together, and under
+    `terminals` that of each (`docs/outputs.md` says what each figure means); None without fused
+    tracks.
 
     Parameters
     ----------
-    pictures : by name the frames, and the bodies of all frames one after the other, of
+    fused_records : by name the frames, and the UAVs of all frames one after the other, of
         `isac_rt.results.columns.TABLES`
     names : of the UAVs
     """
-    if not pictures:
+    if not fused_records:
         return None
-    of = {name: _block(frames, bodies, names) for name, (frames, bodies) in pictures.items()}
+    of = {name: _block(frames, bodies, names) for name, (frames, bodies) in fused_records.items()}
     together = of.pop(SWARM)
     return {**together, "terminals": of}
 
 
 def _block(frames: Columns, bodies: Columns, names: Sequence[str]) -> dict[str, Any]:
-    """The figures of one picture."""
+    """The figures of One set of fused tracks."""
     seen, found = frames["seen"], frames["found"]
     error, ages, reports = frames["error"][found], frames["age"], frames["reports"]
-    heard = reports.sum()
+    received = reports.sum()
     position, velocity, nees = np.mean(error ** [2, 2, 1], axis=0) if len(error) else [None] * 3
     in_view = int(seen.sum())
 
@@ -232,8 +234,8 @@ def _block(frames: Columns, bodies: Columns, names: Sequence[str]) -> dict[str, 
             "velocity_mps": None if velocity is None else float(np.sqrt(velocity)),
         },
         "nees": None if nees is None else float(nees),
-        "reports_per_frame": float(heard / len(seen)),
-        "age_s": float(np.nansum(ages * reports) / heard) if heard else None,
+        "reports_per_frame": float(received / len(seen)),
+        "age_s": float(np.nansum(ages * reports) / received) if received else None,
         "messages": total("messages"),
         "messages_lost": total("lost") - total("late"),
         "messages_late": total("late"),

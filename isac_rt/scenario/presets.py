@@ -59,7 +59,7 @@ Preset = Literal["paper", "plain", "city"]
 
 
 class ReceiverSet(Node):
-    """Receivers and trackers that hear the same samples as the scenario's own. They listen only:
+    """Receivers and trackers that receive the same samples as the scenario's own. They listen only:
     nothing that is sent depends on them."""
 
     preset: Preset | None = None

@@ -77,14 +77,14 @@ def _members(name: Any, uav: dict[str, Any]) -> dict[str, Any] | None:
 
 def _heading(uav: Uav) -> tuple[float, float]:
     """Horizontal unit vector (east, north) in which a UAV sets out; north where it hovers."""
-    way = uav.velocity_mps
+    heading = uav.velocity_mps
     if uav.waypoints is not None:
         first, second = uav.waypoints[0], uav.waypoints[1]
         pairs = zip(first.position_m, second.position_m, strict=True)
         east, north, up = (b - a for a, b in pairs)
-        way = (east, north, up)
-    size = math.hypot(way[0], way[1])
-    return (way[0] / size, way[1] / size) if size > 1e-9 else (0.0, 1.0)
+        heading = (east, north, up)
+    size = math.hypot(heading[0], heading[1])
+    return (heading[0] / size, heading[1] / size) if size > 1e-9 else (0.0, 1.0)
 
 
 def _moved(uav: dict[str, Any], east: float, north: float) -> dict[str, Any]:

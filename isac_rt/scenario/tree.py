@@ -47,7 +47,7 @@ _PARTS = {
 OWN = "own"
 """Name of the scenario's own receivers beside those compared with them."""
 NEAREST_M = 0.05
-"""Two bodies nearer than this are one to the ray tracer."""
+"""Two UAVs nearer than this are one to the ray tracer."""
 
 
 class Scenario(Node):
@@ -111,12 +111,12 @@ class Scenario(Node):
     cooperation: Literal["none", "tracks", "detections"] = "none"
     """What terminals tell each other of what they see. `none`, the default: nothing. `tracks`:
     their confirmed tracks and their own position, an active terminal with its data, a passive one
-    by feedback at `access.feedback_rate_bps`; each makes one picture of what it sees and hears.
+    by feedback at `access.feedback_rate_bps`; each makes one picture of what it sees and receives.
     `detections`: the detections that their tracks rest on instead; each runs one filter over all of
     them, with the errors of poses and clocks as states. What is sent otherwise does not depend on
     it; receivers of the preset `city` use what they are told."""
     compare: dict[Name, ReceiverSet] = Field({})
-    """Further sets of receivers by name, which hear the same samples. By default none."""
+    """Further sets of receivers by name, which receive the same samples. By default none."""
 
     _folder: Path = PrivateAttr(default=Path())
     _formations: dict[str, Formation] = PrivateAttr(default={})

@@ -65,7 +65,8 @@ def if_signal(
 
     Examples
     --------
-    A target 60 m ahead, heard by its own sender: its beat lies in range cell 2 R / (c delay_step).
+    A target 60 m ahead, received by its own sender: its beat lies in range cell 2 R / (c
+    delay_step).
 
     >>> import numpy as np
     >>> import isac_rt as irt
@@ -97,7 +98,7 @@ def noisy_if_signal(
     noise: WhiteNoise,
 ) -> IFCube:
     """`if_signal` with what `add_noise` would add, to the bit, while samples are in the cache."""
-    schedule, tones = heard(waveform, links, receiver, reference)
+    schedule, tones = received_tones(waveform, links, receiver, reference)
     return IFCube(
         samples=method.samples(waveform, tones, noise),
         waveform=waveform,
@@ -119,10 +120,10 @@ def add_noise(cube: IFCube, power: float, seed_words: np.ndarray) -> IFCube:
     return cube
 
 
-def heard(
+def received_tones(
     waveform: Waveform, links: Links, receiver: ReceiveArray, reference: Reference
 ) -> tuple[Schedule, Tones]:
-    """Schedule of the reference chirps, and what is heard in them."""
+    """Schedule of the reference chirps, and what is received in them."""
     schedule, first_block = reference.schedule, reference.first_block
     if schedule is None:
         if not links:

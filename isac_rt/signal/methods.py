@@ -11,7 +11,7 @@ import numpy as np
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels import signal_direct, signal_gridded
 from isac_rt.kernels.jit import twin_of
-from isac_rt.kernels.signal_covered import covered_error
+from isac_rt.kernels.signal_below_noise import below_noise_error
 from isac_rt.kernels.signal_gridded import GRIDDED_ERROR, OVERSAMPLING, WIDTH, grid_size
 from isac_rt.kernels.vector import LANES, new_memory
 from isac_rt.propagation.clutter.merging import resolution_cell
@@ -90,7 +90,7 @@ class Direct:
 @dataclass(frozen=True)
 class Gridded:
     """All paths through a grid of frequencies, for many: relative error `GRIDDED_ERROR`, or as if
-    noise covered all (`faint`: `isac_rt.kernels.signal_covered.covered_error`)."""
+    noise covered all (`faint`: `isac_rt.kernels.signal_below_noise.below_noise_error`)."""
 
     name: ClassVar[str] = "gridded"
     faint: bool = False
@@ -138,7 +138,7 @@ class Auto:
         faint = ~every
         if self.covered and tones.size:
             limit = self.covered * self.noise_power / size
-            faint = ~tones.sight & _covered(waveform, tones, limit)
+            faint = ~tones.sight & _below_noise(waveform, tones, limit)
         top = _strongest(tones.power, self.max_direct)
         alone = ~faint & ((strong & top) | tones.sight | (error > GRIDDED_ERROR))
         if (~alone).sum() * elements <= GRID_PATHS * -(-elements // LANES):
@@ -161,10 +161,10 @@ def _shape(waveform: Waveform, tones: Tones) -> tuple[int, ...]:
     return w.num_groups, tones.rx_delay.shape[1], w.num_chirps, w.num_samples
 
 
-def _covered(waveform: Waveform, tones: Tones, limit: float) -> np.ndarray:
+def _below_noise(waveform: Waveform, tones: Tones, limit: float) -> np.ndarray:
     """Mark the paths (K,) below the noise: the powers [W] of the errors that all paths of their
     range-Doppler cell would have stay within a limit."""
-    error = covered_error(waveform, tones, grid_size(waveform.num_samples, OVERSAMPLING, WIDTH))
+    error = below_noise_error(waveform, tones, grid_size(waveform.num_samples, OVERSAMPLING, WIDTH))
     cell = resolution_cell(waveform, tones.delay, tones.rate)
     number = cell - cell.min()
     if number.max() > MAX_CELLS:
@@ -222,12 +222,14 @@ def add_up(
             carrier = w.carrier_frequency + w.slope * (u - tau)
             phase = w.carrier_frequency * tau + w.slope * tau * (u - tau / 2)
             step = (carrier * rho + w.slope * tau) * ts
-            bend = (carrier * accel / 2 + w.slope * rho * (1 - rho / 2)) * ts**2
+            curvature = (carrier * accel / 2 + w.slope * rho * (1 - rho / 2)) * ts**2
             strength = weight * (t.rx_gain[k, rx] if t.rx_gain.size else 1.0)
-            coarse = np.exp(2j * np.pi * (phase % 1 + np.outer(a, step) + np.outer(a**2, bend)))
-            fine = np.exp(2j * np.pi * (np.outer(step, b) + np.outer(bend, b**2)))
+            coarse = np.exp(
+                2j * np.pi * (phase % 1 + np.outer(a, step) + np.outer(a**2, curvature))
+            )
+            fine = np.exp(2j * np.pi * (np.outer(step, b) + np.outer(curvature, b**2)))
             coarse *= strength
-            both = coarse @ fine + (4j * np.pi * a[:, None] * bend * coarse) @ (b * fine)
+            both = coarse @ fine + (4j * np.pi * a[:, None] * curvature * coarse) @ (b * fine)
             samples[m, rx, p] += both.ravel()[: w.num_samples]
     noise.add_to(samples)
 

@@ -1,5 +1,5 @@
 r"""The paper's separable IF model, for comparison only: what its receivers assume, not what a
-receiver hears.
+receiver receives.
 
 .. math::
 
@@ -23,8 +23,8 @@ from isac_rt.signal.tones import Tones
 
 
 def separable(waveform: Waveform, tones: Tones) -> np.ndarray:
-    """Samples (M, L_rx, P, N) complex128 by the paper's model; groups do not hear each other, paths
-    live for the whole frame."""
+    """Samples (M, L_rx, P, N) complex128 by the paper's model; groups do not receive each other,
+    paths live for the whole frame."""
     w, t = waveform, tones
     start = t.delay - t.rate * w.frame_duration / 2
     fast, slots = (

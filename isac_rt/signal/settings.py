@@ -30,11 +30,11 @@ class Accuracy(Node):
     no run and come on top (1.2 rad for an echo at 3.5 m and 28 m/s across); `isac-rt plan` and the
     summary state them. The default costs at most 0.01 dB of the path's power."""
     max_untraced_m: Annotated[float, Field(ge=0)] = 2.0
-    """Farthest that a terminal flies between two knots, places from which rays search for chains of
-    walls [m], for `budget`; 0: they search from where it is in each frame. A longer way is faster
-    and may miss paths over walls that are seen for a shorter way only. Where the chains run, and
-    which of them are free, is found out in every frame. The default is shorter than walls are
-    wide."""
+    """Farthest that a terminal flies between two time samples, places from which rays search for
+    chains of walls [m], for `budget`; 0: they search from where it is in each frame. A longer way
+    is faster and may miss paths over walls that are seen for a shorter way only. Where the chains
+    run, and which of them are free, is found out in every frame. The default is shorter than walls
+    are wide."""
 
     def applies(self, name: str) -> bool:
         return name == "preset" or self.preset == "budget"

@@ -3,7 +3,7 @@ what was, against the full model.
 
 Estimates come from `PILOT_FRAMES` frames of the run, spread over it, with a margin for the others
 and the plan's own limits as ceilings. The truth is measured on other frames, drawn at random: every
-one of them is traced in full, with spherical wavefronts of all elements, with every body where its
+one of them is traced in full, with spherical wavefronts of all elements, with every UAV where its
 trajectory puts it at the ends of the frame, and with the direct synthesis. Paths that were missed
 are those that Sionna's own solver finds with `CHECK_RAYS`.
 """
@@ -27,8 +27,8 @@ from isac_rt.propagation.clutter.merging import apart_db, resolution_cell
 from isac_rt.propagation.clutter.rayleigh import RayleighClutter
 from isac_rt.propagation.legs.geometry import plane_of_each_face, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.propagation.store import CachedPropagation
-from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import power_map
@@ -263,7 +263,7 @@ def _mirrors_item(record: dict[str, dict[str, Any]] | None) -> Item:
     shares = [100 * row["share"] for row in record.values()]
     kept = " to ".join(dict.fromkeys(f"{share:.2g}" for share in (min(shares), max(shares))))
     said = (
-        f"mirrors {counts}: scatterers lit or heard by way of one, {kept} % of what a terminal "
+        f"mirrors {counts}: scatterers lit or received by way of one, {kept} % of what a terminal "
         "radiates"
     )
     rest = max(row["share_left_out"] for row in record.values())
@@ -357,7 +357,7 @@ def _errors(
     plan, level = setup.plan, frame.noise_power(link)
     kept, use = frame.paths[link], frame.uses[link]
     ratio = plan.cell_noise_gain() / level
-    heard, weak, _ = plan.chosen(found, level)
+    received, weak, _ = plan.chosen(found, level)
     missed = ~present(full, found) & (full.delay <= plan.longest_delay)
     delay = np.append(found.delay[weak], full.delay[missed])
     cell = np.floor(delay / setup.waveform.delay_step).astype(int)
@@ -368,7 +368,7 @@ def _errors(
         "left_out_bound": use.left_out,
         "missed_chains": float(missed.sum()),
         "missed_strongest": float((full.power[missed] * ratio).max(initial=0.0)),
-        "plane_rad": _plane_error(setup, frame, link, found.select(heard & ~weak)),
+        "plane_rad": _plane_error(setup, frame, link, found.select(received & ~weak)),
         "plane_bound_rad": use.plane_error,
         "clutter_db": _clutter_error(setup, frame, link),
         "clutter_bound_db": error_for(Density.of(setup.scenario.clutter).per_metre),
@@ -377,7 +377,7 @@ def _errors(
         "turning_rad": _turning_error(setup, frame.number, kept),
         "turning_bound_rad": use.turning_error,
         "synthesis": _synthesis_error(setup, frame, link, level),
-        "covered": _covered_error(setup, frame, link, level),
+        "covered": _below_noise_error(setup, frame, link, level),
         "covered_bound": plan.covered,
     }
 
@@ -442,9 +442,9 @@ def clutter_by_cell(
     )
     state = LinkState(link, epoch, start, end)
     seen = field.seen(state)
-    heard = seen.length < SPEED_OF_LIGHT * setup.plan.longest_delay
-    motion = seen.length[heard] / SPEED_OF_LIGHT, seen.rate[heard] / SPEED_OF_LIGHT
-    power = level * (seen.magnitude * state.elements(setup.antennas, seen))[heard] ** 2
+    received = seen.length < SPEED_OF_LIGHT * setup.plan.longest_delay
+    motion = seen.length[received] / SPEED_OF_LIGHT, seen.rate[received] / SPEED_OF_LIGHT
+    power = level * (seen.magnitude * state.elements(setup.antennas, seen))[received] ** 2
     return resolution_cell(setup.waveform, *motion), power
 
 
@@ -488,7 +488,7 @@ def _with_chains(kept: PathSet) -> PathSet:
 def _turning_error(setup: Setup, frame: int, kept: PathSet) -> float:
     """Largest phase by which elements see a kept path change otherwise than the centroids within
     the frame [rad]: every transmit element with the first and the last receive element, where the
-    bodies are at the ends of the frame and as they are turned there."""
+    UAVs are at the ends of the frame and as they are turned there."""
     reach, epoch = frame_reach(setup.waveform), setup.timetable.epoch(frame)
     moving = _with_chains(kept)
     if not len(moving):
@@ -511,7 +511,7 @@ def delays(
     city: CityMesh,
     elements: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:
-    """(K,) delays of the same chains and scatterers with the bodies elsewhere [s], between two of
+    """(K,) delays of the same chains and scatterers with the UAVs elsewhere [s], between two of
     their `elements` (3,), (3,) about the centroids."""
     local = {
         name: replace(pose, position=pose.position - city.origin) for name, pose in poses.items()
@@ -563,7 +563,7 @@ def _synthesis_error(setup: Setup, frame: Frame, link: Link, level: float) -> fl
     return float(np.linalg.norm(fast - exact)) / scale if scale else 0.0
 
 
-def _covered_error(setup: Setup, frame: Frame, link: Link, level: float) -> float:
+def _below_noise_error(setup: Setup, frame: Frame, link: Link, level: float) -> float:
     """Most that the synthesis of paths that noise covers errs in a range-Doppler cell, over its
     noise, if all channels' errors were in phase."""
     kept = frame.paths[link]

@@ -12,7 +12,7 @@ from isac_rt.frame.link import Link
 
 @dataclass(frozen=True)
 class Connections:
-    """Who can hear whom, in which blocks, and by how much clocks are apart.
+    """Who can receive whom, in which blocks, and by how much clocks are apart.
 
     Attributes
     ----------

@@ -15,10 +15,10 @@ Ghosts and paths of the city so weak that all that are left out of one range cel
 ``propagation.weakest_path_db`` below the noise of a range-Doppler-antenna cell: powers add,
 whatever the phases, on average. Chains of walls that no ray met are missed
 (`isac_rt.propagation.legs.chains`); those that are met are placed without error. The share of
-paths that is missed is taken for the share that only one half of the knots finds, the even or the
-odd ones: the second half of the rays adds half of that number, and what all further rays would add
-is taken for twice as much as that. Chances of being met are spread over decades, so that rules for
-equal chances (capture and recapture) state a tenth of the truth and less. All paths over
+paths that is missed is taken for the share that only one half of the time samples finds, the even
+or the odd ones: the second half of the rays adds half of that number, and what all further rays
+would add is taken for twice as much as that. Chances of being met are spread over decades, so that
+rules for equal chances (capture and recapture) state a tenth of the truth and less. All paths over
 `COUNTS_DB` show the share: those over `MATTERS_DB`, which count, are too few to.
 
 What is not modelled whatever the budget: directions that turn within a frame (`turning_bound`, no
@@ -108,8 +108,8 @@ class Plan:
 
     @property
     def max_untraced(self) -> float:
-        """Most flight of a terminal between two knots, places from which rays search for walls; 0:
-        they search from each frame's own [m]."""
+        """Most flight of a terminal between two time samples, places from which rays search for
+        walls; 0: they search from each frame's own [m]."""
         return 0.0 if self.preset == "everything" else self.accuracy.max_untraced_m
 
     def synthesis(self, num_paths: int, noise_power: float = 0.0) -> Method:
@@ -130,14 +130,14 @@ class Plan:
         `MOST_SPREAD` at most."""
         frames = self.timetable.frames
         poses = [self.swarm.poses(self.timetable.epoch(frame)) for frame in range(frames)]
-        way = max(
+        flown_distance = max(
             sum(
                 float(np.linalg.norm(b[name].position - a[name].position))
                 for a, b in itertools.pairwise(poses)
             )
             for name in self.swarm.terminals
         )
-        count = min(frames, MOST_SPREAD, int(np.ceil(way)) + 1)
+        count = min(frames, MOST_SPREAD, int(np.ceil(flown_distance)) + 1)
         return np.unique(np.linspace(0, frames - 1, count).round().astype(int)).tolist()
 
     @cached_property
@@ -157,7 +157,7 @@ class Plan:
 
     @property
     def reach(self) -> float:
-        """Farthest from its terminal that a surface can be heard [m]."""
+        """Farthest from its terminal that a surface can be received [m]."""
         return self.longest_delay * SPEED_OF_LIGHT / 2
 
     @property
@@ -166,7 +166,7 @@ class Plan:
         return self.preset == "everything" or self.propagation.model != "ray_traced"
 
     def mesh_radius(self, centre: np.ndarray) -> float:
-        """A surface farther than this from a place takes part in nothing that is heard, whole
+        """A surface farther than this from a place takes part in nothing that is received, whole
         metres [m].
 
         All points of a path of length L, what shadows it included, lie within L/2 of the middle
@@ -184,8 +184,8 @@ class Plan:
         fastest = max(
             float(np.linalg.norm(body.velocity)) for pose in poses for body in pose.values()
         )
-        way = 2 * fastest * frame_reach(self.waveform)
-        return float(np.ceil(farthest + self.reach + way + REACH_MARGIN_M))
+        flown_distance = 2 * fastest * frame_reach(self.waveform)
+        return float(np.ceil(farthest + self.reach + flown_distance + REACH_MARGIN_M))
 
     def cell_noise_gain(self) -> float:
         """|gain|^2 of a path over this is its power over the noise of a range-Doppler-antenna cell,
@@ -197,15 +197,17 @@ class Plan:
         the most that a range cell loses over the noise."""
         over_noise = paths.power * self.cell_noise_gain() / noise_power
         everything = self.preset == "everything"
-        heard = (
+        received = (
             np.full(len(paths), True)
             if everything
             else paths.delay - motion(paths, self.waveform) <= self.longest_delay
         )
         always = np.isin(paths.kind, (PathKind.LINE_OF_SIGHT, PathKind.TARGET, PathKind.LEAKAGE))
         cell = np.floor(paths.delay / self.waveform.delay_step).astype(np.int64)
-        weak, left_out = faintest(np.where(heard & ~always, over_noise, np.inf), cell, self.weakest)
-        return heard, weak, left_out
+        weak, left_out = faintest(
+            np.where(received & ~always, over_noise, np.inf), cell, self.weakest
+        )
+        return received, weak, left_out
 
     def apply(self, paths: PathSet, noise_power: float) -> tuple[PathSet, Use]:
         """Select what a link's frame needs of its paths.
@@ -216,13 +218,13 @@ class Plan:
         noise_power : of a sample at the receiver [W]
         """
         w = self.waveform
-        heard, weak, left_out = self.chosen(paths, noise_power)
-        kept = paths.select(heard & ~weak)
+        received, weak, left_out = self.chosen(paths, noise_power)
+        kept = paths.select(received & ~weak)
         plane_error, straight_error = plane_bound(kept, self.antennas, w), straight_bound(kept, w)
         plane, straight = plane_error <= self.phase_share, straight_error <= self.phase_share
         use = Use(
             found=len(paths),
-            unheard=int((~heard).sum()),
+            unheard=int((~received).sum()),
             weak=int(weak.sum()),
             kept={name: count for name, count in kept.counts().items() if count},
             bounces=int(kept.bounces.max(initial=0)),
@@ -307,15 +309,15 @@ def turning_bound(
 
     Where a wavefront of radius R comes nearer or turns by the way v t of its source and of the
     body, the delay of an element at r changes by :math:`r\,v t/(R - v t - r)` at most beside that
-    of the centroid. A body that turns itself moves its elements by so much.
+    of the centroid. A UAV that turns itself moves its elements by so much.
     """
     t, k = frame_reach(waveform), 2 * np.pi * _highest(waveform) / SPEED_OF_LIGHT
     poses = swarm.poses(paths.epoch)
-    way = {
+    flown_distance = {
         name: t * (float(np.linalg.norm(p.velocity)) + t * float(np.linalg.norm(p.acceleration)))
         for name, p in poses.items()
     }
-    targets = np.array([*(way[name] for name in paths.target_names), 0.0])[paths.target]
+    targets = np.array([*(flown_distance[name] for name in paths.target_names), 0.0])[paths.target]
     ends = (
         (paths.tx, paths.rx, antennas.tx_positions, paths.tx_radius),
         (paths.rx, paths.tx, antennas.rx_positions, paths.rx_radius),
@@ -326,17 +328,17 @@ def turning_bound(
         here = poses[own].to_world(positions)
         then = [flight.pose(paths.epoch + later).to_world(positions) for later in (-t, t)]
         r = float(np.linalg.norm(positions, axis=1).max())
-        flown = way[own] + np.where(paths.target >= 0, targets, way[other])
-        flown = np.where(paths.kind == PathKind.DIFFUSE, way[own], flown)
+        flown = flown_distance[own] + np.where(paths.target >= 0, targets, flown_distance[other])
+        flown = np.where(paths.kind == PathKind.DIFFUSE, flown_distance[own], flown)
         room = radius - flown - r
-        # beside the body itself a direction may turn to the opposite one
+        # beside the UAV itself a direction may turn to the opposite one
         out += k * np.where(room > flown / 2, r * flown / np.maximum(room, flown / 2), 2 * r)
         out += k * max(float(np.linalg.norm(at - here, axis=1).max()) for at in then)
     return np.where(paths.kind == PathKind.LEAKAGE, 0.0, out)
 
 
 def flight_of_light(paths: PathSet, waveform: Waveform, speed: float) -> float:
-    """Phase by which bodies move while light is on its way, estimated for the longest path [rad].
+    """Phase by which UAVs move while light is on its way, estimated for the longest path [rad].
 
     Parameters
     ----------

@@ -78,7 +78,7 @@ def check_memory(antennas: Antennas, timetable: Timetable) -> None:
 
 
 def check_flights(swarm: Swarm, timetable: Timetable) -> None:
-    """Refuse flights on which two bodies meet, or on which the numbers run out of float64's range:
+    """Refuse flights on which two UAVs meet, or on which the numbers run out of float64's range:
     at such a frame there are no directions between them. In very long runs only every so manyth
     frame is looked at.
 
@@ -94,8 +94,8 @@ def check_flights(swarm: Swarm, timetable: Timetable) -> None:
             name: np.array([flight.pose(t).position for t in epochs])
             for name, flight in swarm.trajectories.items()
         }
-    for name, way in places.items():
-        if not np.isfinite(way).all() or np.abs(way).max() > 1e12:
+    for name, polyline in places.items():
+        if not np.isfinite(polyline).all() or np.abs(polyline).max() > 1e12:
             raise ScenarioError(
                 f"swarm.{name}: flies beyond all bounds; lower its velocity, or the time between "
                 "its waypoints"
@@ -145,15 +145,15 @@ def check_passage(swarm: Swarm, timetable: Timetable, city: CityMesh) -> None:
     solid = obstacles(city, starts - city.origin) if any(inside) else empty_city("", city.origin)
     turn = ", or turn the faces of a room inward" if all(inside) else ""
     for name, flight in swarm.trajectories.items():
-        times, places = flight.way(begin, end)
-        way = places - city.origin
+        times, places = flight.polyline(begin, end)
+        polyline = places - city.origin
         keys = "waypoints" if swarm.uavs[name].waypoints else "position_m or velocity_mps"
-        if enclosed(solid, way[0]):
+        if enclosed(solid, polyline[0]):
             raise ScenarioError(
                 f"swarm.{name}: starts inside a building of {city.name} or under its ground, at "
                 f"{_said(places[0])} m; change its {keys}{turn}"
             )
-        found = first_passage(city, _off_the_ends(way))
+        found = first_passage(city, _off_the_ends(polyline))
         if found is not None:
             a, b = found.segment, found.segment + 1
             when = times[a] + found.share * (times[b] - times[a])
@@ -197,11 +197,11 @@ def check_reach(settings: City | None, city: CityMesh, reach: float) -> None:
     raise ScenarioError(f"{said}; {f'{origin}{where}, or ' if where else ''}move the swarm")
 
 
-def _off_the_ends(way: np.ndarray) -> np.ndarray:
+def _off_the_ends(polyline: np.ndarray) -> np.ndarray:
     """A way (T, 3) that begins and ends `TOUCH_M` later and earlier; what is shorter is a point."""
-    out = way.copy()
+    out = polyline.copy()
     for end, inner in ((0, 1), (-1, -2)):
-        step = way[inner] - way[end]
+        step = polyline[inner] - polyline[end]
         length = float(np.linalg.norm(step))
         out[end] += step * min(TOUCH_M / length, 0.5) if length else 0.0
     return out
@@ -245,7 +245,7 @@ def warn_of_aliases(
 
 
 def _closing(own: Pose, other: Pose, antennas: Antennas, passes: int) -> float:
-    """Range rate of another body [m/s], 0 where it is out of view (of either end, for a line of
+    """Range rate of another UAV [m/s], 0 where it is out of view (of either end, for a line of
     sight)."""
     line = other.position - own.position
     line = line / np.linalg.norm(line)
@@ -307,10 +307,10 @@ def warn_of_interference(
 def _direct_gain(tx: Pose, rx: Pose, antennas: Antennas, waveform: Waveform) -> float:
     """Power that a receiver gets of a direct path over that of one transmit antenna: Friis'
     equation with the patterns of both elements, times the antennas that send at once."""
-    way = rx.position - tx.position
-    distance = float(np.linalg.norm(way))
-    sent = float(antennas.element_gain(tx.to_body(way / distance)))
-    received = float(antennas.element_gain(rx.to_body(-way / distance)))
+    polyline = rx.position - tx.position
+    distance = float(np.linalg.norm(polyline))
+    sent = float(antennas.element_gain(tx.to_body(polyline / distance)))
+    received = float(antennas.element_gain(rx.to_body(-polyline / distance)))
     at_once = waveform.num_tx if waveform.bands > 1 else 1
     return at_once * sent * received * (waveform.wavelength / (4 * np.pi * distance)) ** 2
 

@@ -141,16 +141,16 @@ class Frame:
         link, s = Link(*link), self._setup
         arriving, noise = self._arriving(link), self._noise(link)
         method = s.plan.synthesis(sum(len(p) for _, p in arriving), noise.power)
-        heard = self._listening(link)
+        received = self._listening(link)
         if ends is None and not s.has_ideal_hardware:
             ends = self.ends(link)
         if ends is not None and not ends.ideal:
             make = extension("hardware_samples")
-            cube: IFCube = make(s.waveform, arriving, *heard, ends, method, noise)
+            cube: IFCube = make(s.waveform, arriving, *received, ends, method, noise)
             return cube
-        return noisy_if_signal(s.waveform, arriving, *heard, method, noise)
+        return noisy_if_signal(s.waveform, arriving, *received, method, noise)
 
-    def heard(self, link: tuple[str, str]) -> IFCube:
+    def received(self, link: tuple[str, str]) -> IFCube:
         """The samples that a link's receiver is given, the board's errors taken out."""
         return self._setup.calibrated(self.samples(link))
 
@@ -417,7 +417,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
 
     Raises
     ------
-    ScenarioError  If the run cannot be: two bodies meet, it does not fit into memory.
+    ScenarioError  If the run cannot be: two UAVs meet, it does not fit into memory.
 
     Examples
     --------
@@ -612,13 +612,13 @@ def city_of(scenario: Scenario, radius: float = np.inf) -> CityMesh:
     return city_about(centre, scenario.city, scenario.folder, carrier, radius)
 
 
-def propagation_in(city: CityMesh, scenario: Scenario, knot_spacing: float = 0.0) -> Propagation:
+def propagation_in(city: CityMesh, scenario: Scenario, sample_spacing: float = 0.0) -> Propagation:
     """The scenario's propagation model in a city, which need not be the scenario's own."""
     waveform, swarm = waveform_of(scenario.radio, scenario.array), swarm_of(scenario)
     antennas = antennas_of(scenario.array, waveform)
     free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
     settings = scenario.propagation, scenario.clutter
-    return make_propagation(Ground(*settings, swarm, city, waveform, free, knot_spacing))
+    return make_propagation(Ground(*settings, swarm, city, waveform, free, sample_spacing))
 
 
 def trace(scenario: Scenario, frame: int, *, setup: Setup | None = None) -> dict[Link, PathSet]:

@@ -18,7 +18,7 @@ from isac_rt.frame.link import Link
 from isac_rt.plain import plain, restored
 from isac_rt.results.provenance import provenance
 from isac_rt.results.recorder import Figures, Recorder, Results
-from isac_rt.results.scoring import Heard
+from isac_rt.results.scoring import LinkResult
 from isac_rt.runtime import tracing_in_one_thread
 from isac_rt.scenario.tree import OWN, Scenario
 from isac_rt.simulation.fall_back import Schedules
@@ -34,12 +34,12 @@ from isac_rt.simulation.stations import (
     terminal_with,
 )
 from isac_rt.simulation.stopwatch import Stopwatch
-from isac_rt.track.parts import KnownBody
+from isac_rt.track.parts import ReportedUav
 from isac_rt.track.terminal import Receiver
 
 _LOG = logging.getLogger(__name__)
 Progress = Callable[[int, int], None]
-Jobs = dict[Link, Future[list[Heard]]]
+Jobs = dict[Link, Future[list[LinkResult]]]
 Carried = dict[Link, Future[list[dict[str, Any]]]]
 
 
@@ -218,9 +218,9 @@ class _Run:
         self,
         frame: Frame,
         link: Link,
-        reports: Sequence[Sequence[KnownBody]],
+        reports: Sequence[Sequence[ReportedUav]],
         before: Future[Any] | None,
-    ) -> list[Heard]:
+    ) -> list[LinkResult]:
         """Process a frame with a link's receivers, those of the scenario first; all get the same
         samples, and each its own reports.
 
@@ -228,7 +228,7 @@ class _Run:
         ends.
         """
         with self.stopwatch.stage("synthesis"):
-            cube = frame.heard(link).shared()
+            cube = frame.received(link).shared()
         if before is not None:
             before.result()
         with self.stopwatch.stage("receive"):
@@ -258,22 +258,22 @@ class _Run:
     def collect(self, frame: Frame, jobs: Jobs) -> None:
         """Wait for a frame's receivers, score and record it, take the own receivers' advice."""
         results = {link: job.result() for link, job in jobs.items()}
-        heard = {link: by_set[0] for link, by_set in results.items()}
+        received = {link: by_set[0] for link, by_set in results.items()}
         with self.stopwatch.stage("track"):
             if self.setup.scenario.access.feedback:
-                self._feed_back(frame.number, heard)
+                self._feed_back(frame.number, received)
             snapshot = frame.number in self.snapshots
             for i, one in enumerate(self.sets.values()):
                 of_set = {link: by_set[i] for link, by_set in results.items()}
                 one.record(frame, of_set, snapshot and i == 0)
-            self.schedules.take_advice({link: h.reception for link, h in heard.items()})
+            self.schedules.take_advice({link: h.reception for link, h in received.items()})
 
-    def _feed_back(self, frame: int, heard: Mapping[Link, Heard]) -> None:
+    def _feed_back(self, frame: int, received: Mapping[Link, LinkResult]) -> None:
         """Exchange feedback over every link whose active terminal received the frame."""
-        for link in heard:
-            at_active = heard.get(Link(link.tx, link.tx))
+        for link in received:
+            at_active = received.get(Link(link.tx, link.tx))
             if at_active is not None:
-                self.own.stations[link].feed_back(frame, heard[link], at_active)
+                self.own.stations[link].feed_back(frame, received[link], at_active)
 
     def memory(self, carried: Sequence[Mapping[Link, dict[str, Any]]]) -> dict[str, Any]:
         """Return what a later call needs to go on after the frames so far: those since the last

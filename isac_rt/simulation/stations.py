@@ -13,12 +13,12 @@ from isac_rt.receive.settings import Receivers
 from isac_rt.registry import extension
 from isac_rt.results.metrics import SymbolCount
 from isac_rt.results.recorder import Recorder
-from isac_rt.results.records import FrameRecord, LateRecord, ObserverRecord, PictureRecord
-from isac_rt.results.scoring import Heard, Scorer
+from isac_rt.results.records import FrameRecord, FusedRecord, LateRecord, ObserverRecord
+from isac_rt.results.scoring import LinkResult, Scorer
 from isac_rt.results.swarm import SwarmScorer, View
 from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.simulation.setup import Frame, Setup
-from isac_rt.track.parts import KnownBody, Late
+from isac_rt.track.parts import Late, ReportedUav
 from isac_rt.track.reference import TerminalState
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal, Receiver
 from isac_rt.world.swarm import Pose, Swarm
@@ -83,21 +83,28 @@ class Station:
         frame: Frame,
         cube: IFCube,
         maps: bool,
-        reports: Sequence[KnownBody] = (),
-    ) -> Heard:
+        reports: Sequence[ReportedUav] = (),
+    ) -> LinkResult:
         """Receive one frame and track; `reports` are the targets that the receiver knows of from
         others. Runs in a thread of its own; only this station's state changes."""
         begun = time.thread_time()
         timetable, (tx, rx) = self.setup.timetable, self.link
         when = timetable.epoch(frame.number, tx)
         own = self.setup.believed(self.setup.swarm.trajectories[rx].pose(when))
-        mates = self._mates(frame.number, when)
+        reported_poses = self._reported_poses(frame.number, when)
         state = int(TerminalState.TRACKING)
         late: tuple[Late, ...] = ()
         if isinstance(self.terminal, ActiveTerminal):
             payload, clutter = frame.sent[tx].payload, frame.expected.get(tx)
             reception, tracks = self.terminal.step(
-                cube, payload, own, when, clutter=clutter, mates=mates, told=reports, maps=maps
+                cube,
+                payload,
+                own,
+                when,
+                clutter=clutter,
+                reported_poses=reported_poses,
+                reports=reports,
+                maps=maps,
             )
         else:
             modulated = timetable.modulated(frame.number)
@@ -106,14 +113,14 @@ class Station:
                 own,
                 when,
                 modulated,
-                mates=mates,
+                reported_poses=reported_poses,
                 sender=self._sender(when),
-                told=reports,
+                reports=reports,
                 maps=maps,
             )
             state, late = int(self.terminal.status), self.terminal.late
         self.seconds += time.thread_time() - begun
-        return Heard(reception, tracks, state, late)
+        return LinkResult(reception, tracks, state, late)
 
     def _sender(self, when: float) -> Pose | None:
         """Return where the link's transmitter reports to be; None: it reports nothing."""
@@ -122,7 +129,7 @@ class Station:
             return None
         return s.believed(s.swarm.trajectories[self.link.tx].pose(when))
 
-    def _mates(self, frame: int, when: float) -> list[Pose]:
+    def _reported_poses(self, frame: int, when: float) -> list[Pose]:
         """Return the poses that the other end of the link, or at an active terminal those of all
         links, report, as far as the receiver asks."""
         s = self.setup
@@ -132,14 +139,14 @@ class Station:
         names = s.timetable.with_role("passive", frame) if self.link.own else [tx]
         return [s.believed(s.swarm.trajectories[name].pose(when)) for name in names if name != rx]
 
-    def feed_back(self, frame: int, heard: Heard, at_active: Heard) -> None:
+    def feed_back(self, frame: int, received: LinkResult, at_active: LinkResult) -> None:
         """Exchange the passive terminal's feedback after a frame, and the active one's answer."""
         if not isinstance(self.terminal, PassiveTerminal):
             return
         s, when = self.setup, self.setup.timetable.epoch(frame, self.link.tx)
         answer = extension("feedback")(
-            heard.reception,
-            heard.tracks,
+            received.reception,
+            received.tracks,
             at_active.tracks,
             s.antennas.num_rx,
             s.connections.offset_std(self.link, when),
@@ -167,10 +174,10 @@ class Station:
         self.scorer.restore(memory["scorer"])
         self.feedback, self.seconds = memory["feedback"], memory["seconds"]
 
-    def record(self, frame: Frame, heard: Heard) -> ObserverRecord:
+    def record(self, frame: Frame, received: LinkResult) -> ObserverRecord:
         """Compare the frame with the truth."""
         paths, sent = frame.paths[self.link], frame.sent[self.link.tx]
-        return self.scorer.record(frame.number, paths, sent, heard, frame.noise_power(self.link))
+        return self.scorer.record(frame.number, paths, sent, received, frame.noise_power(self.link))
 
 
 class Exchange(Protocol):
@@ -179,14 +186,14 @@ class Exchange(Protocol):
     def step(
         self,
         frame: int,
-        heard: Mapping[Link, Heard],
+        received: Mapping[Link, LinkResult],
         symbols: Mapping[Link, SymbolCount],
         late: Mapping[Link, Sequence[LateRecord]],
     ) -> dict[str, View]:
         """Return the fused tracks after a frame, by terminal and of all together (`SWARM`)."""
         ...
 
-    def told(self, link: Link, frame: int, time: float) -> list[KnownBody]:
+    def reports(self, link: Link, frame: int, time: float) -> list[ReportedUav]:
         """Return the targets that a link's receiver knew of after a frame, at a time [s]."""
         ...
 
@@ -224,23 +231,23 @@ class StationSet:
             SwarmScorer(timetable),
         )
 
-    def reports(self, link: Link, frame: int) -> list[KnownBody]:
+    def reports(self, link: Link, frame: int) -> list[ReportedUav]:
         """Return what the link's receiver knows from others in a frame: what it knew
         `PREFETCHED_FRAMES` frames before, so that no frame waits for the one before."""
         when = self.recorder.timetable.epoch(frame, link.tx)
-        return self.exchange.told(link, frame - PREFETCHED_FRAMES, when) if self.exchange else []
+        return self.exchange.reports(link, frame - PREFETCHED_FRAMES, when) if self.exchange else []
 
-    def record(self, frame: Frame, heard: Mapping[Link, Heard], snapshot: bool) -> None:
+    def record(self, frame: Frame, received: Mapping[Link, LinkResult], snapshot: bool) -> None:
         """Compare a frame with the truth, and exchange reports after it."""
         timetable, number = self.recorder.timetable, frame.number
-        records = {link: self.stations[link].record(frame, h) for link, h in heard.items()}
-        late = {link: self.stations[link].scorer.late(number, h) for link, h in heard.items()}
-        pictures: dict[str, PictureRecord] = {}
+        records = {link: self.stations[link].record(frame, h) for link, h in received.items()}
+        late = {link: self.stations[link].scorer.late(number, h) for link, h in received.items()}
+        fused_records: dict[str, FusedRecord] = {}
         if self.exchange is not None:
             symbols = {link: o.symbols for link, o in records.items()}
-            views = self.exchange.step(number, heard, symbols, late)
+            views = self.exchange.step(number, received, symbols, late)
             poses = {name: self.swarm.poses(view.time) for name, view in views.items()}
-            pictures = self.fused.record(number, views, records, poses)
+            fused_records = self.fused.record(number, views, records, poses)
         self.recorder.add(
             FrameRecord(
                 frame=number,
@@ -251,7 +258,7 @@ class StationSet:
                 snapshot=snapshot,
                 uses=frame.uses,
                 dropped=frame.dropped,
-                pictures=pictures,
+                fused_records=fused_records,
             )
         )
         for link, frames in late.items():

@@ -323,9 +323,9 @@ def quantities() -> tuple[str, ...]:
 
 def put(tree: dict[str, Any], key: str, value: Any) -> None:
     """Set a dotted key, making the mappings on its way; numbers index lists."""
-    *way, last = key.split(".")
+    *parents, last = key.split(".")
     here: Any = tree
-    for name in way:
+    for name in parents:
         if isinstance(here, list):
             here = here[int(name)]
         else:

@@ -342,8 +342,8 @@ def _flown(tree: dict[str, Any]) -> np.ndarray:
     scenario = Scenario.model_validate(tree)
     timetable = _timetable(scenario)
     span = timetable.epoch(0), timetable.epoch(timetable.frames - 1)
-    ways = (flight.way(*span)[1] for flight in swarm_of(scenario).trajectories.values())
-    return np.vstack([*ways])
+    polylines = (flight.polyline(*span)[1] for flight in swarm_of(scenario).trajectories.values())
+    return np.vstack([*polylines])
 
 
 def _timetable(scenario: Scenario) -> Timetable:

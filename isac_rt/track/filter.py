@@ -1,4 +1,4 @@
-"""The extended Kalman filter of one body: measurement model of both terminals, prediction, update
+"""The extended Kalman filter of one UAV: measurement model of both terminals, prediction, update
 and birth."""
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ STD_FLOOR = np.array([1e-3, 1e-2, 2e-4, 2e-4])
 are not noise but the interpolation between cells, alike in successive frames: about 0.002 cell in
 range, 0.02 in velocity, 0.002 in angle."""
 BIRTH_SPEED_STD = 10.0
-"""Per axis [m/s]: before its first detection a body is taken to stand still in the world, give or
+"""Per axis [m/s]: before its first detection a UAV is taken to stand still in the world, give or
 take this."""
 BIRTH_POSITION_STD_LIMIT = 100.0
 """A single detection that fixes the position worse than this [m] starts no track (near the line
 through both terminals a bistatic length says nothing about where the reflector is)."""
 MANOEUVRE_TIME = 1.0
-"""Correlation time of a body's acceleration [s]. Turns, braking and gusts hold theirs for half a
+"""Correlation time of a UAV's acceleration [s]. Turns, braking and gusts hold theirs for half a
 second to some seconds; with PX4's default limits of 3 m/s^2 and 4 m/s^3 one needs 0.75 s."""
 _ITERATIONS = 10
 ROUNDING = 1e-12
@@ -80,7 +80,7 @@ def measure(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None)
 
     Parameters
     ----------
-    state : (..., 6 or 9) world position, velocity, acceleration of the body [m, m/s, m/s^2]
+    state : (..., 6 or 9) world position, velocity, acceleration of the UAV [m, m/s, m/s^2]
     own : pose of the receiver
     transmitter : (6 or 9,) state of the transmitter; None for the one-way form
 
@@ -111,7 +111,7 @@ def _leg_jacobian(offset: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray,
 
 
 def jacobian(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None) -> np.ndarray:
-    """Derivative of `measure` with respect to the body's states (..., S): (..., 4, S)."""
+    """Derivative of `measure` with respect to the UAV's states (..., S): (..., 4, S)."""
     leg, turn = _leg_jacobian(state[..., :3] - own.position, state[..., 3:6] - own.velocity)
     out = np.zeros((*state.shape[:-1], 4, state.shape[-1]))
     out[..., :2, :6] = leg
@@ -122,7 +122,7 @@ def jacobian(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None
 
 
 def transmitter_jacobian(state: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
-    """Derivative of the bistatic `measure` of bodies (..., 6 or 9) with respect to the
+    """Derivative of the bistatic `measure` of UAVs (..., 6 or 9) with respect to the
     transmitter's state (S,): (..., 4, S)."""
     out = np.zeros((*state.shape[:-1], 4, transmitter.size))
     offset, speed = state[..., :3] - transmitter[:3], state[..., 3:6] - transmitter[3:6]

@@ -16,8 +16,8 @@ class Key(NamedTuple):
 
 
 class Name(NamedTuple):
-    """A body's name in the swarm: the earliest track known of it, by the time of its confirmation
-    [s]. All who know of that track give the body the same name."""
+    """A UAV's name in the swarm: the earliest track known of it, by the time of its confirmation
+    [s]. All who know of that track give the UAV the same name."""
 
     since: float
     origin: str
@@ -26,7 +26,7 @@ class Name(NamedTuple):
 
 @dataclass(frozen=True)
 class Fused:
-    """One body of a picture.
+    """One UAV of a set of fused tracks.
 
     Attributes
     ----------

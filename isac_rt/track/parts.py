@@ -32,8 +32,8 @@ clutter."""
 Measured = TypeVar("Measured", Detections, Prediction)
 
 
-class KnownBody(NamedTuple):
-    """A body that a terminal knows of from others: its position and velocity (6,), and the terminal
+class ReportedUav(NamedTuple):
+    """A UAV that a terminal knows of from others: its position and velocity (6,), and the terminal
     of the swarm that it is by its own report, "" if it is none."""
 
     terminal: str
@@ -53,7 +53,7 @@ class Own:
     Attributes
     ----------
     pose, time : its own pose, and the middle of the frame [s]
-    mates : poses that other terminals report, for the calibration of the own hardware
+    reported_poses : poses that other terminals report, for the calibration of the own hardware
     reports : targets and terminals that others report
     cooperates : whether others report anything at all
     sender : a passive terminal's transmitter as its data report it; None where they say nothing
@@ -69,8 +69,8 @@ class Own:
 
     pose: Pose
     time: float
-    mates: Sequence[Pose] = ()
-    reports: Sequence[KnownBody] = ()
+    reported_poses: Sequence[Pose] = ()
+    reports: Sequence[ReportedUav] = ()
     cooperates: bool = False
     sender: Track | None = None
     over_other_path: bool = False

@@ -45,7 +45,7 @@ class Tracking(Node):
     at the edge of the view, nor those on a face of the mesh, nor those that stand still beside each
     other as a building does that the mesh lacks. A track is confirmed only if two of its detections
     could have started one, and not if it lies in a face or behind a wall, or is a wall's image of a
-    nearer one, or of a nearer body that others told of (`cooperation`). One that fits such an
+    nearer one, or of a nearer UAV that others told of (`cooperation`). One that fits such an
     image, or lies behind a wall, in three frames in a row ends. Two confirmed ones within 0.5 m of
     which no frame shows both are one. With `cooperation` a passive terminal confirms none before
     its sixth frame: until then the active one cannot have told it what flies near its line of

@@ -33,9 +33,9 @@ from isac_rt.receive.types import (
 from isac_rt.track.filter import Ambiguity
 from isac_rt.track.parts import (
     Equipment,
-    KnownBody,
     Late,
     Own,
+    ReportedUav,
     delayed,
     follow,
     is_placed,
@@ -134,8 +134,8 @@ class ActiveTerminal(Stateful):
         time: float,
         *,
         clutter: ExpectedClutter | None = None,
-        mates: Sequence[Pose] = (),
-        told: Sequence[KnownBody] = (),
+        reported_poses: Sequence[Pose] = (),
+        reports: Sequence[ReportedUav] = (),
         maps: bool = False,
     ) -> tuple[Reception, TrackSet]:
         """Receive and track one frame.
@@ -144,15 +144,15 @@ class ActiveTerminal(Stateful):
         ----------
         time : of its middle [s]
         clutter : what the terminal expects of its mesh there
-        mates : poses that other terminals report, for its calibration
-        told : bodies that others report
+        reported_poses : poses that other terminals report, for its calibration
+        reports : UAVs that others report
         """
         cube = self.equipment.hardware.correct(cube, time)
         before = self.state.correction
         if clutter is not None and before is not None:
             clutter = before.apply(clutter)
         self.tracker.predict(time)
-        own = Own(own_pose, time, mates, told)
+        own = Own(own_pose, time, reported_poses, reports)
         expect = self.equipment.expect_targets
         self._hints = Hints(clutter, None if expect is None else expect(self.tracker, own))
         reception = _reception(self.receive(cube, payload, clutter, maps))
@@ -233,9 +233,9 @@ class PassiveTerminal(Stateful):
         time: float,
         modulated: bool,
         *,
-        mates: Sequence[Pose] = (),
+        reported_poses: Sequence[Pose] = (),
         sender: Pose | None = None,
-        told: Sequence[KnownBody] = (),
+        reports: Sequence[ReportedUav] = (),
         maps: bool = False,
     ) -> tuple[Reception, TrackSet]:
         """Receive and track one frame.
@@ -244,14 +244,14 @@ class PassiveTerminal(Stateful):
         ----------
         time : of its middle [s]
         modulated : whether it carries data, which is public
-        mates : pose that the transmitter reports, for the terminal's calibration
+        reported_poses : pose that the transmitter reports, for the terminal's calibration
         sender : pose that its data report, which counts once a frame was read
-        told : bodies that others report
+        reports : UAVs that others report
         """
         cube = self.equipment.hardware.correct(cube, time)
         self.reference.predict(time)
         self.tracker.predict(time)
-        own = self._own(Own(own_pose, time, mates, told, sender is not None), sender)
+        own = self._own(Own(own_pose, time, reported_poses, reports, sender is not None), sender)
         self._hints = Hints(own.clutter)
         reception = self._read(cube, own, modulated, maps)
         refused = reception.line_of_sight and not self.reference.is_plausible(reception)

@@ -1,6 +1,6 @@
 """Extended Kalman filter, association and the life of tracks.
 
-A track is the world position, velocity and acceleration of one body. The terminal that keeps it
+A track is the world position, velocity and acceleration of one UAV. The terminal that keeps it
 knows its own pose, so what is reported is relative to it, and leaves the acceleration out. Names
 outside, symbols inside: x, P mean and covariance; F, Q, H, R the model.
 """
@@ -41,7 +41,7 @@ ROUNDING = 1e-9
 
 FLAT_STD = 0.1
 """Standard deviation of the direction cosine that is taken for 0 where an array does not observe
-an axis: bodies fly within some six degrees of the array's plane."""
+an axis: UAVs fly within some six degrees of the array's plane."""
 
 
 def in_plane(detections: Detections) -> Detections:
@@ -69,7 +69,7 @@ def assign(cost: np.ndarray) -> list[tuple[int, int]]:
 
 @dataclass
 class Track:
-    """One body that a terminal follows.
+    """One UAV that a terminal follows.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Track:
 
     @classmethod
     def of_body(cls, body: Gaussian, acceleration_std: float = 0.0, time: float = -np.inf) -> Track:
-        """A body that others say there is, with position and velocity (6,): a track that was never
+        """A UAV that others say there is, with position and velocity (6,): a track that was never
         born."""
         mean = np.concatenate([body.mean, np.zeros(3)])
         covariance = np.diag([0.0] * 6 + [acceleration_std**2] * 3)
@@ -148,11 +148,11 @@ class TrackSet:
 
 
 def united(tracks: Sequence[Track]) -> list[Track]:
-    """Tracks, oldest first, of which no two confirmed ones are of one body.
+    """Tracks, oldest first, of which no two confirmed ones are of one UAV.
 
     Where a terminal's own errors part a track from its body's detections, these start another one,
     and the two share them. One known to be within `LEAST_APART` of an older one goes, unless this
-    frame shows both; the older one goes on from where the body was seen last.
+    frame shows both; the older one goes on from where the UAV was seen last.
     """
     kept: list[Track] = []
     for track in tracks:

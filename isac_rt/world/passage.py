@@ -35,39 +35,39 @@ class Passage(NamedTuple):
     face: int
 
 
-def first_passage(city: CityMesh, way: np.ndarray) -> Passage | None:
+def first_passage(city: CityMesh, polyline: np.ndarray) -> Passage | None:
     """The first face that a way goes through; None if it is clear.
 
     Parameters
     ----------
     city : CityMesh
-    way : (T, 3) corners of a polyline, local [m]
+    polyline : (T, 3) corners of a polyline, local [m]
     """
-    return _first(city, np.arange(city.num_faces), way, 0)
+    return _first(city, np.arange(city.num_faces), polyline, 0)
 
 
-def _beside(city: CityMesh, way: np.ndarray, faces: np.ndarray | slice) -> np.ndarray:
+def _beside(city: CityMesh, polyline: np.ndarray, faces: np.ndarray | slice) -> np.ndarray:
     """(N,) which of some faces have boxes that meet that of a way (T, 3)."""
     low, high = city.boxes
-    inside = (low[faces] <= way.max(axis=0)) & (high[faces] >= way.min(axis=0))
+    inside = (low[faces] <= polyline.max(axis=0)) & (high[faces] >= polyline.min(axis=0))
     return np.asarray(inside.all(axis=1))
 
 
-def _first(city: CityMesh, faces: np.ndarray, way: np.ndarray, begin: int) -> Passage | None:
+def _first(city: CityMesh, faces: np.ndarray, polyline: np.ndarray, begin: int) -> Passage | None:
     """By halves: only faces whose boxes meet that of a part of the way are looked at again."""
-    faces = faces[_beside(city, way, faces)]
-    if not faces.size or len(way) < 2:
+    faces = faces[_beside(city, polyline, faces)]
+    if not faces.size or len(polyline) < 2:
         return None
-    if len(way) == 2:
-        hit, share = hits(city.corners[faces], way[0], way[1])
+    if len(polyline) == 2:
+        hit, share = hits(city.corners[faces], polyline[0], polyline[1])
         return (
             Passage(begin, float(share.min()), int(faces[hit[share.argmin()]]))
             if hit.size
             else None
         )
-    half = len(way) // 2
-    return _first(city, faces, way[: half + 1], begin) or _first(
-        city, faces, way[half:], begin + half
+    half = len(polyline) // 2
+    return _first(city, faces, polyline[: half + 1], begin) or _first(
+        city, faces, polyline[half:], begin + half
     )
 
 
@@ -92,7 +92,7 @@ def hits(corners: np.ndarray, start: np.ndarray, end: np.ndarray) -> tuple[np.nd
 
 
 def obstacles(city: CityMesh, places: np.ndarray) -> CityMesh:
-    """Return the part of a city that bodies may not be enclosed by: all of it, but for a room that
+    """Return the part of a city that UAVs may not be enclosed by: all of it, but for a room that
     encloses all of their places (N, 3), local.
 
     A room is a connected surface as large as the whole mesh, so that nothing lies outside it, or

@@ -301,7 +301,7 @@ class Uav(Node):
 
     role: Literal["active", "passive", "target"]
     """What the UAV does: `active` sends the chirps and senses with their echoes, `passive` decodes
-    the data and senses with the chirps it hears, `target` only reflects."""
+    the data and senses with the chirps it receives, `target` only reflects."""
     position_m: Vector | None = None
     """Position at the start of the run: x east, y north, z up [m]. A UAV has either this or
     `waypoints`."""

@@ -156,7 +156,7 @@ class Trajectory:
             rotation = rotation @ self._mount
         return Pose(position, velocity, acceleration, rotation)
 
-    def way(self, start: float, end: float) -> tuple[np.ndarray, np.ndarray]:
+    def polyline(self, start: float, end: float) -> tuple[np.ndarray, np.ndarray]:
         """Times (T,) [s] and places (T, 3) [m] of the flight between two times, whose straight
         connections keep within `SAG_M` of it."""
         times = np.array([start, end])

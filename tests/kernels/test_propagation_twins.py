@@ -70,7 +70,7 @@ def test_planes_of_faces():
 def test_segments_that_pass_a_disc():
     """Segments near and far, one of length zero, some spared. Planted bug: the distance before the
     segment left out of the Fresnel zone."""
-    import isac_rt.propagation.legs.bodies  # noqa: F401  # has the twin
+    import isac_rt.propagation.legs.discs  # noqa: F401  # has the twin
 
     rng = np.random.default_rng(9)
     count, discs = 300, 7
@@ -79,7 +79,7 @@ def test_segments_that_pass_a_disc():
     before = rng.uniform(0, 60, count)
     total = before + np.linalg.norm(ends - starts, axis=1) + rng.uniform(0, 60, count)
     places, radii = rng.uniform(-25, 25, (discs, 3)), rng.uniform(0.1, 4, discs)
-    name = "isac_rt.propagation.legs.bodies.near"
+    name = "isac_rt.propagation.legs.discs.near"
     for spared in (rng.random((count, discs)) < 0.2, rng.random((1, discs)) < 0.3):
         paths = starts, ends, before, total
         assert_twins_agree(name, *paths, places, radii, spared, 0.0039, 3.7, rtol=1e-12)

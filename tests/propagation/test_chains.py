@@ -1,4 +1,4 @@
-"""Chains of walls that rays find from knots, and the paths that images make of them: against
+"""Chains of walls that rays find from time samples, and the paths that images make of them: against
 Sionna's own solver, image lattices, and the geometry of walls that end."""
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def swarm_over(a, p, u, **changes) -> scenario.Scenario:
     return scenario.Scenario.model_validate(tree)
 
 
-def tracer(s: scenario.Scenario, city: CityMesh, knot_spacing: float = 1e6):
-    return propagation_in(city, s, knot_spacing)
+def tracer(s: scenario.Scenario, city: CityMesh, sample_spacing: float = 1e6):
+    return propagation_in(city, s, sample_spacing)
 
 
 def mesh(quads, materials=None, of=None) -> CityMesh:
@@ -144,7 +144,7 @@ def test_the_paths_are_those_of_sionnas_solver(streets):
 
 def test_a_frame_is_a_function_of_itself(streets):
     """Bit for bit the same whether the frames before it were traced, in another order, or none.
-    Planted bug: chains of all knots so far are pooled."""
+    Planted bug: chains of all time samples so far are pooled."""
     frames, s, city = streets
     swarm, backwards = swarm_of(s), tracer(s, city, 2.0)
     for t, _, got in frames[::-5]:
@@ -159,8 +159,8 @@ def test_a_frame_is_a_function_of_itself(streets):
 
 
 def test_halves_of_the_knots_know_nothing_of_each_other(streets):
-    """Even and odd knots share neither a place nor a direction, and their chains together are the
-    pool. Planted bug: both halves are the even knots."""
+    """Even and odd time samples share neither a place nor a direction, and their chains together
+    are the pool. Planted bug: both halves are the even time samples."""
     from isac_rt.propagation.legs.chains import directions
 
     frames, s, city = streets

@@ -13,7 +13,7 @@ from truths.clutter import sionna_power
 from isac_rt import scenario
 from isac_rt.frame.link import Link
 from isac_rt.propagation.clutter.cells import area_for
-from isac_rt.propagation.ways import LinkState
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import load_city
 from isac_rt.world.city.mesh import distance_to_triangles

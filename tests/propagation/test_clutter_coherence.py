@@ -13,7 +13,7 @@ from scipy.ndimage import uniform_filter
 
 from isac_rt import scenario
 from isac_rt.frame.link import Link
-from isac_rt.propagation.ways import LinkState
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import CityMesh, load_city
 
@@ -157,7 +157,7 @@ def test_sight_alone_changes_no_range_cell_at_once():
     """Flying 50 m up a street and round its corner, the change that births and deaths make in a
     range cell from one frame to the next is at most 0.15 of its local rms (mean power over 2 m and
     15 frames; where that is 1e-4 of the whole and more). Planted bug: sight switched at the
-    knots."""
+    time samples."""
     model, swarm = flown(ROUND_A_CORNER, cell_area_per_metre_m=0.15, smallest_cell_m2=0.05)
     city, flight, cells = crossing(), swarm.trajectories["A"], model.field.cells
     times = (np.arange(round(5.0 / 7.7824e-3)) + 0.5) * 7.7824e-3

@@ -14,7 +14,7 @@ from isac_rt import scenario
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation.ways import LinkState
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.world.city import load_city
 

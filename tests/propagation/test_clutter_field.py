@@ -25,7 +25,7 @@ from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.clutter import cells as clutter_cells
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.pathset import PathKind
-from isac_rt.propagation.ways import LinkState
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.receive.directions import searches
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import ExpectedClutter
@@ -423,7 +423,7 @@ def test_each_scatterer_against_an_oracle(name):
     normal /= np.linalg.norm(normal)
     model, swarm = flown(city, (0.3, -1.1, 0.9), (-7.7, 1.4, 2.2), cell_area_per_metre_m=0.5)
     still = swarm.poses(0.0)
-    bodies = {
+    discs = {
         "A": replace(
             still["A"], velocity=np.array([3.1, -7.3, 1.9]), acceleration=np.array([0.7, 1.1, -2.3])
         ),
@@ -437,7 +437,7 @@ def test_each_scatterer_against_an_oracle(name):
         return body.position + t * body.velocity + t**2 / 2 * body.acceleration
 
     for tx, rx in (("A", "P"), ("A", "A")):
-        start, end = bodies[tx], bodies[rx]
+        start, end = discs[tx], discs[rx]
         seen = model.field.seen(LinkState(Link(tx, rx), 0.0, start, end))
         assert len(seen.index) > 20
         for i in range(0, len(seen.index), 7):
@@ -581,8 +581,8 @@ def test_expected_clutter_is_the_walls_integral_and_its_mistakes_are_what_they_s
     assert plain.delay_rate * C == pytest.approx(-2 * towards @ speed, rel=0, abs=1e-9)
     directive, _ = expectation(city, speed, at + city.origin, "cosine", 10 * np.log10(4))
     cosines = 4 * plain.departure[:, 1]  # 4 cos(angle) of an element of 6 dBi, there and back
-    heard, ahead = directive.clutter("A", pose, 0.0, amplitude), cosines > 0
-    assert heard.power == pytest.approx((cosines**2 * plain.power)[ahead], rel=1e-6, abs=0)
+    received, ahead = directive.clutter("A", pose, 0.0, amplitude), cosines > 0
+    assert received.power == pytest.approx((cosines**2 * plain.power)[ahead], rel=1e-6, abs=0)
     error = (0.31, -0.17, 0.23)
     wrong = copy.clutter("A", pose, 0.0, amplitude, Mistakes(velocity=error, level_db=3.1))
     assert wrong.power == pytest.approx(10**0.31 * plain.power, rel=1e-6, abs=0)
@@ -603,10 +603,10 @@ def test_expected_clutter_is_the_walls_integral_and_its_mistakes_are_what_they_s
 
 @pytest.mark.sionna
 def test_knots_of_a_flight_and_their_blend():
-    """A straight flight has its knots evenly along it, ends included, and a B-spline reproduces a
-    straight line: the weighted knots are the place. Planted bugs: the last piece of the way left
-    out; knots counted from the one behind."""
-    from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight
+    """A straight flight has its time samples evenly along it, ends included, and a B-spline
+    reproduces a straight line: the weighted time samples are the place. Planted bugs: the last
+    piece of the way left out; time samples counted from the one behind."""
+    from isac_rt.propagation.clutter.visibility import SAMPLE_SPACING, Flight
 
     start, speed, duration, origin = (
         np.array([1.7, -3.1, 8.9]),
@@ -623,19 +623,19 @@ def test_knots_of_a_flight_and_their_blend():
         origin,
     )
     way = np.linalg.norm(speed) * duration
-    count = int(np.ceil(way / KNOT_SPACING))
+    count = int(np.ceil(way / SAMPLE_SPACING))
     even = start - origin + np.linspace(0, duration, count + 1)[:, None] * speed
-    assert flight.knots.shape == even.shape
-    assert flight.knots == pytest.approx(even, abs=1e-9)  # rounding
+    assert flight.time_samples.shape == even.shape
+    assert flight.time_samples == pytest.approx(even, abs=1e-9)  # rounding
     for time in np.linspace(0, duration, 38):
         weights = flight.blend(time)
         assert sum(weights.values()) == pytest.approx(1, abs=1e-12)
         inside = 3.1 * way / count < time * np.linalg.norm(speed) < way - 3.1 * way / count
         if inside:
-            place = sum(g * flight.knots[k] for k, g in weights.items())
+            place = sum(g * flight.time_samples[k] for k, g in weights.items())
             assert place == pytest.approx(start - origin + time * speed, abs=1e-9)
         away = [
-            np.linalg.norm(flight.knots[k] - (start - origin + time * speed))
+            np.linalg.norm(flight.time_samples[k] - (start - origin + time * speed))
             for k, g in weights.items()
             if g > 0
         ]

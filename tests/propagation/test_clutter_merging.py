@@ -21,14 +21,14 @@ from isac_rt.propagation.clutter.cells import Cells, Density, cut
 from isac_rt.propagation.clutter.field import in_local
 from isac_rt.propagation.clutter.merging import (
     EASED,
-    Heard,
+    VisibleCells,
     allowed_area,
-    covered,
     merge,
+    merged_below_noise,
     resolution_cell,
 )
-from isac_rt.propagation.clutter.sight import Flight, ever_ahead
-from isac_rt.propagation.ways import LinkState
+from isac_rt.propagation.clutter.visibility import Flight, ever_ahead
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.simulation.audit import check
 from isac_rt.simulation.setup import Setup, swarm_of
 from isac_rt.world.city import CityMesh, load_city
@@ -145,7 +145,7 @@ def test_allowed_areas_are_those_of_the_rule():
     power = np.concatenate([np.full(100, 1 / 300), [4.0, 5.0], [0.004], [0.8]])
     cell = np.concatenate([np.full(100, 7), [9, 9], [2], [3]])
     area = np.full(power.size, 1.7)
-    heard = Heard(np.arange(power.size), power, cell)
+    heard = VisibleCells(np.arange(power.size), power, cell)
     found = allowed_area(heard, area, np.full(power.size, 2.1), 0.2, 1.0)
     assert found[:100] == pytest.approx(2.1 * 4 ** (4 / 3), rel=1e-12)
     assert found[100:102] == pytest.approx([1.7 * 9 / 6 / p for p in (4.0, 5.0)], rel=1e-12)
@@ -158,7 +158,7 @@ def test_allowed_areas_are_those_of_the_rule():
     assert eased[102:] == pytest.approx(3.0 * found[102:], rel=1e-12)
 
 
-def nine_of_ten(cells: Cells, place, left: Cells, heard: Heard, least: float) -> float:
+def nine_of_ten(cells: Cells, place, left: Cells, heard: VisibleCells, least: float) -> float:
     """Error of noise plus clutter that nine of ten cells keep to [dB], of those that hold more
     than `least` of the noise."""
     stands_for = dict(zip(place.tolist(), left.area / cells.area[place], strict=True))
@@ -182,9 +182,9 @@ def test_the_rule_is_eased_as_far_as_the_error_allows(level, expected):
     for _ in range(2):
         index = np.flatnonzero(rng.random(len(cells)) < 0.8)
         power = level * cells.area[index] * rng.uniform(0.2, 3.0, index.size)
-        heard.append(Heard(index, power, cells.points[index] @ [0.9, 2.3, 1.1] // 2.7))
+        heard.append(VisibleCells(index, power, cells.points[index] @ [0.9, 2.3, 1.1] // 2.7))
     heard = [h._replace(cell=h.cell.astype(int) - int(h.cell.min())) for h in heard]
-    found = covered(cells, heard, finest, 0.2)
+    found = merged_below_noise(cells, heard, finest, 0.2)
     for eased in EASED:
         limit = np.full(len(cells), np.inf)
         for some in heard:
@@ -324,7 +324,7 @@ def test_the_budget_check_measures_what_merging_does():
 
 def turning_tree() -> dict:
     """Both ends turn while they fly through the street, the transmitter by 100 degrees."""
-    ways = {
+    scatter_paths = {
         "A": (((2.4, -22.7, 9.3), -40), ((1.3, -8.1, 10.2), 5), ((-1.9, 6.3, 9.8), 60)),
         "P": (((-1.3, 17.9, 11.1), 170), ((0.2, 12.4, 10.9), 200), ((1.1, 8.3, 12.2), 215)),
     }
@@ -337,7 +337,7 @@ def turning_tree() -> dict:
                 for k, (place, yaw) in enumerate(way)
             ],
         }
-        for name, way in ways.items()
+        for name, way in scatter_paths.items()
     }
     return swarm_tree() | {"swarm": swarm}
 

@@ -12,7 +12,7 @@ from test_clutter_coherence import F_C, LAMBDA, C, crossing
 
 from isac_rt import scenario
 from isac_rt.frame.link import Link
-from isac_rt.propagation.ways import LinkState
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.simulation.setup import propagation_in, swarm_of
 
 pytestmark = pytest.mark.sionna

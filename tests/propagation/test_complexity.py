@@ -66,7 +66,7 @@ def test_legs_are_traced_from_terminals_only(uavs):
 @pytest.mark.sionna
 def test_rays_search_once_a_knot_however_many_frames_there_are():
     """The same way in ten frames and in forty: as many searches, each of a place and a number once.
-    Planted bug: the knots of the last frame are not kept."""
+    Planted bug: the time samples of the last frame are not kept."""
     counts = []
     for frames in (10, 40):
         setup = prepare(

@@ -8,7 +8,6 @@ import pytest
 from scipy import special
 from scipy.integrate import quad
 
-from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.diffraction import (
     LIT_REACH,
     SHADOW_REACH,
@@ -16,6 +15,7 @@ from isac_rt.propagation.legs.diffraction import (
     edge_factor,
     knife_edge,
 )
+from isac_rt.propagation.legs.discs import UavDiscs
 
 LAMBDA = 299_792_458.0 / 77e9
 
@@ -84,8 +84,8 @@ def test_bodies_shade_every_straight_part_that_passes_them():
     radii = rng.uniform(0.1, 0.9, 8)
     chains = rng.uniform(-20, 20, (300, 4, 3))
     chains[:, 1:3] = places[rng.integers(0, 8, (300, 2))] + rng.normal(0, 2.5, (300, 2, 3))
-    bodies = Bodies(names, places, radii)
-    found = bodies.factor(chains, LAMBDA, bodies.spared([("c",)]))
+    discs = UavDiscs(names, places, radii)
+    found = discs.factor(chains, LAMBDA, discs.spared([("c",)]))
     truth, shaded = np.ones(300, complex), 0
     for i, chain in enumerate(chains):
         parts = np.linalg.norm(np.diff(chain, axis=0), axis=1)

@@ -130,11 +130,11 @@ def test_conductors_turn_the_field_about_their_normals():
     for normals, offsets, start, end in cases:
         value, corners, length = amplitude(normals, offsets, [METAL] * len(normals), start, end)
         segments = np.diff(corners, axis=0)
-        ways = segments / np.linalg.norm(segments, axis=1, keepdims=True)
-        field = theta(ways[0])
+        scatter_paths = segments / np.linalg.norm(segments, axis=1, keepdims=True)
+        field = theta(scatter_paths[0])
         for n in normals:
             field = 2 * (n @ field) * n - field
-        truth = field @ theta(-ways[-1]) * LAMBDA / (4 * np.pi * length)
+        truth = field @ theta(-scatter_paths[-1]) * LAMBDA / (4 * np.pi * length)
         assert abs(truth) * 4 * np.pi * length / LAMBDA > 0.05
         assert abs(value - truth) < 1e-4 * LAMBDA / (
             4 * np.pi * length
@@ -154,8 +154,8 @@ def test_panes_reflect_each_polarisation_with_its_own_coefficient():
     ):
         n = np.array(normal)
         value, corners, length = amplitude([n], [offset], [PANE], a, end)
-        ways = np.diff(corners, axis=0)
-        into, out = ways / np.linalg.norm(ways, axis=1, keepdims=True)
+        scatter_paths = np.diff(corners, axis=0)
+        into, out = scatter_paths / np.linalg.norm(scatter_paths, axis=1, keepdims=True)
         te, tm = echoes(PANE, abs(into @ n))
         s = np.cross(into, n) / np.linalg.norm(np.cross(into, n))
         field = theta(into)

@@ -105,7 +105,7 @@ def test_the_estimate_is_that_of_two_searches(monkeypatch):
 def test_fewer_rays_miss_about_as_much_as_is_estimated(scene, rays, every):
     """The estimate is within three times the paths missed (of 300 to 3,000 rays: 2.2 to 0.9 times
     as many; by the paths over -10 dB alone 0.06 in Munich). Planted bug: both halves are the even
-    knots (nothing is missed)."""
+    time samples (nothing is missed)."""
     few, many = (ready(scene, f"propagation.rays={number}") for number in (rays, 60_000))
     frames, missed = list(range(0, many.timetable.frames, every)), 0
     for number in frames:

@@ -75,7 +75,7 @@ def test_sight_over_an_edge_is_fresnels_integral():
 
 def test_sight_does_not_know_the_frames_before():
     """A frame alone, in another order, and at the ends of the run, is the same to the bit. Planted
-    bug: crossings of the knots behind forgotten and not found again."""
+    bug: crossings of the time samples behind forgotten and not found again."""
     wall = rectangle((-9.0, 78.0, -9.9), (18.0, 0, 0), (0, 0, 19.9), METAL)
     scene = joined(wall, rectangle(*SCREEN, METAL))
     flight = dict(a=(0.4, 0.0, -4.3), p=(0.0, 5.0, 60.0), speed_a=(0.3, 0.1, 9.6), frames=128)
@@ -122,8 +122,10 @@ def powers(model, flight, city, times, lift: float = 0.02):
         truth = np.zeros(len(cells))
         truth[asked] = np.where(np.isinf(nu), nu < 0, np.abs(edge_factor(np.clip(nu, -30, 30))))
         blend = np.zeros(len(cells))
-        for knot, share in sight.flights["A"].blend(time).items():
-            blend += share * sight.shadows.sees(sight.flights["A"].knots[knot], cells.points, n)
+        for time_sample, share in sight.flights["A"].blend(time).items():
+            blend += share * sight.shadows.sees(
+                sight.flights["A"].time_samples[time_sample], cells.points, n
+            )
         ours = sight.share("A", replace(pose, position=place), time)
         row = (r / 4).astype(int)
         out.append([np.bincount(row, weight * a**4, 500) for a in (truth, rays, ours, blend)])

@@ -16,11 +16,11 @@ from isac_rt import scenario
 from isac_rt.frame.link import Link
 from isac_rt.kernels.propagation_edges import MOST_TRIED, near
 from isac_rt.propagation.legs import edges as edges_of_cities
-from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.direct import direct_legs
+from isac_rt.propagation.legs.discs import UavDiscs
 from isac_rt.propagation.legs.edges import Edges
 from isac_rt.propagation.pathset import PathKind
-from isac_rt.propagation.ways import LinkState
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.simulation.setup import propagation_in
 from isac_rt.world.city import CityMesh
 from isac_rt.world.city.mesh import empty_city
@@ -175,7 +175,7 @@ def test_nothing_is_switched_when_flying_round_a_corner():
         places = np.array(start) + np.arange(0.0, 28.0, 0.005)[:, None] * np.array(ahead)
         poses = {"A": a} | {str(i): pose(q) for i, q in enumerate(places)}
         legs = direct_legs(
-            poses, [("A", str(i)) for i in range(len(places))], edges, Bodies.of({}, {}), LAMBDA
+            poses, [("A", str(i)) for i in range(len(places))], edges, UavDiscs.of({}, {}), LAMBDA
         )
         distance = np.linalg.norm(places - a.position, axis=1)
         now = np.zeros(len(places), complex)
@@ -236,10 +236,10 @@ def test_clutter_behind_a_body_is_in_its_shadow():
     a, body = pose((0.3, -1.1, 0.9)), np.array([0.9, 7.1, 1.3])
     bare = model.field.seen(LinkState(Link("A", "A"), 0.0, a, a))
     for names in (("U",), ("A", "U")):
-        bodies = Bodies(names, np.array([body, body])[: len(names)], np.full(len(names), 0.23))
+        discs = UavDiscs(names, np.array([body, body])[: len(names)], np.full(len(names), 0.23))
         if "A" in names:
-            bodies = Bodies(names, np.array([a.position, body]), bodies.radii)
-        seen = model.field.seen(LinkState(Link("A", "A"), 0.0, a, a), bodies)
+            discs = UavDiscs(names, np.array([a.position, body]), discs.radii)
+        seen = model.field.seen(LinkState(Link("A", "A"), 0.0, a, a), discs)
         ratio, checked = seen.magnitude / bare.magnitude, 0
         for i, point in enumerate(model.field.cells.points[bare.index]):
             r = np.linalg.norm(point - a.position)
@@ -278,8 +278,8 @@ def test_no_edge_near_a_path_is_passed_over(together, monkeypatch):
 
         def detour(share, ends=ends):
             at = a + share * (b - a)
-            ways = [np.linalg.norm(at - end, axis=2, keepdims=True) for end in ends]
-            return ways[0] + ways[1] - np.linalg.norm(ends[0] - ends[1])
+            scatter_paths = [np.linalg.norm(at - end, axis=2, keepdims=True) for end in ends]
+            return scatter_paths[0] + scatter_paths[1] - np.linalg.norm(ends[0] - ends[1])
 
         for _ in range(60):
             one, other = low + (high - low) / 3, high - (high - low) / 3

@@ -32,7 +32,7 @@ from isac_rt.extensions.city_receivers.expectation import make_expectation
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation.ways import LinkState
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.randomness import generator
 from isac_rt.simulation.setup import propagation_in, swarm_of
 from isac_rt.track.expectation import Mistakes
@@ -158,7 +158,7 @@ def test_each_way_against_an_oracle(pattern):
         city, (0.3, -1.1, 0.9), (-7.7, 1.4, 2.2), cell_area_per_metre_m=0.5, mirrors=2
     )
     still = swarm.poses(0.0)
-    bodies = {
+    discs = {
         "A": replace(
             still["A"], velocity=np.array([3.1, -7.3, 1.9]), acceleration=np.array([0.7, 1.1, -2.3])
         ),
@@ -179,7 +179,7 @@ def test_each_way_against_an_oracle(pattern):
 
     checked = {True: 0, False: 0}
     for tx, rx in (("A", "P"), ("A", "A")):
-        start, end = bodies[tx], bodies[rx]
+        start, end = discs[tx], discs[rx]
         sets = model.two_bounces.paths(
             LinkState(Link(tx, rx), 0.0, start, end), model._free.antennas
         )
@@ -459,7 +459,7 @@ def test_ways_by_mirrors_are_coherent_with_a_separate_sum(name):
     are what both use, so that delays and sight are what is compared.
 
     The separate sum switches at the edges of mirrors too, of which there are more than shadow
-    edges. Planted bug: the image at the last knot in place of the pose.
+    edges. Planted bug: the image at the last time sample in place of the pose.
     """
     w0 = [{"time_s": float(t), "position_m": list(map(float, x))} for t, x in STREETS[name]]
     s = scenario.Scenario.model_validate(
@@ -631,14 +631,19 @@ def test_what_a_passive_terminal_expects_of_mirrors():
         def imaged(point, m=m):
             return point - 2 * (point @ m.normal - m.offset) * m.normal
 
-        ways = []
+        scatter_paths = []
         for t in (-lags, 0.0, lags):
             ends = [sender[:3] + t * sender[3:], own.position + t * own.velocity]
             ends[0 if part.before else 1] = imaged(ends[0 if part.before else 1])
-            ways.append(sum(np.linalg.norm(place - end, axis=1) for end in ends))
+            scatter_paths.append(sum(np.linalg.norm(place - end, axis=1) for end in ends))
         rows = slice(begin, begin + len(place))
-        assert np.abs(C * found.delay[rows] - ways[1]).max() < 1e-9
-        assert np.abs(C * found.delay_rate[rows] - (ways[2] - ways[0]) / (2 * lags)).max() < 1e-4
+        assert np.abs(C * found.delay[rows] - scatter_paths[1]).max() < 1e-9
+        assert (
+            np.abs(
+                C * found.delay_rate[rows] - (scatter_paths[2] - scatter_paths[0]) / (2 * lags)
+            ).max()
+            < 1e-4
+        )
         target = (
             place if part.before else place - 2 * (place @ m.normal - m.offset)[:, None] * m.normal
         )

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.active import receive_active
-from isac_rt.receive.clutter_filter import occupied_factor, remove_standing, runs
+from isac_rt.receive.clutter_filter import occupied_factor, remove_static, runs
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.symbols.powers import demodulate
@@ -59,7 +59,7 @@ def test_all_chirps_of_all_receivers_tell_a_run_from_noise():
     rng = np.random.default_rng(12)
     spectra = (rng.standard_normal((1, 15, 90, 12, 2)) @ np.array([1, 1j])).astype(np.complex64)
     spectra[:, :, 40:60] *= 2
-    rows = remove_standing(spectra, np.zeros((1, 12), np.int64), 15)
+    rows = remove_static(spectra, np.zeros((1, 12), np.int64), 15)
     assert np.array_equal(np.flatnonzero(rows), np.arange(38, 62))  # and the margin of two cells
 
 
@@ -99,9 +99,9 @@ def test_what_stands_still_is_removed_and_what_moves_is_not():
         cube(w, schedule, payload, still, FEW), known(w, schedule, payload, FEW, 1), 256
     )
     before = np.abs(bare[..., row, :]).max()
-    rows = remove_standing(bare, schedule, 15)
+    rows = remove_static(bare, schedule, 15)
     assert rows[row] and np.abs(bare[..., row, :]).max() < 3e-5 * before
-    remove_standing(both, schedule, 15)
+    remove_static(both, schedule, 15)
     change = np.linalg.norm(both[..., row, :] - alone[..., row, :]) / np.linalg.norm(
         alone[..., row, :]
     )
@@ -118,9 +118,9 @@ def test_all_cells_can_be_filtered():
     spectra[:, :, 17] = 100.0
     spectra[:, :, 40] = tone
     kept = spectra.copy()
-    assert not remove_standing(kept, schedule, 15).any()
+    assert not remove_static(kept, schedule, 15).any()
     assert np.array_equal(kept, spectra)
-    assert remove_standing(spectra, schedule, None).all()
+    assert remove_static(spectra, schedule, None).all()
     assert np.abs(spectra[:, :, 17]).max() < 1e-4
     for m, tx in ((0, 0), (2, 1)):
         sent = schedule[m] == tx

@@ -722,9 +722,9 @@ def climbed(local: LocalSpectra, delay: float, delay_rate: float) -> tuple[float
         gradient = np.array([g[2] - g[1], g[4] - g[3]]) / (2 * step)
         hxx, hyy = g[2] - 2 * g[0] + g[1], g[4] - 2 * g[0] + g[3]
         hxy = (g[8] - g[7] - g[6] + g[5]) / 4 / step**2 if hxy is None else hxy
-        bend = np.array([[hxx / step**2, hxy], [hxy, hyy / step**2]])
-        up = np.linalg.eigvalsh(bend).max() < 0
-        move = -np.linalg.solve(bend, gradient) if up else np.copysign(step, gradient)
+        curvature = np.array([[hxx / step**2, hxy], [hxy, hyy / step**2]])
+        up = np.linalg.eigvalsh(curvature).max() < 0
+        move = -np.linalg.solve(curvature, gradient) if up else np.copysign(step, gradient)
         place = place + np.clip(move, -3 * step, 3 * step)
     return tuple((coupling @ place * units).tolist())
 
@@ -747,8 +747,8 @@ def test_refinement_is_that_of_plain_numpy(beam: bool | None):
         assert np.array_equal(found.channels, local.respond(found.delay, found.delay_rate))
 
 
-@pytest.mark.parametrize("bend", [[[3.1, 1.7], [1.7, 2.3]], [[2.3, -1.1], [-1.1, 4.7]]])
-def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
+@pytest.mark.parametrize("curvature", [[[3.1, 1.7], [1.7, 2.3]], [[2.3, -1.1], [-1.1, 4.7]]])
+def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(curvature):
     """Newton's step is exact there, with the mixed derivative in it. Planted bugs: its sign, or a
     half of it; the gradient over a step for over two; one end of the reach left open. Where the
     paraboloid is none the step is up, and a far top is come near by no more than three times the
@@ -758,17 +758,17 @@ def test_one_step_of_the_refinement_reaches_the_top_of_a_paraboloid(bend):
     )
 
     def moved(
-        top: tuple[float, float], bend: np.ndarray, mixed: float | None = None
+        top: tuple[float, float], curvature: np.ndarray, mixed: float | None = None
     ) -> list[float]:
         off = 0.2 * stencil[: 9 if mixed is None else 5] - top
-        powers = np.exp(-np.einsum("ki,ij,kj->k", off, bend, off) / 2)
+        powers = np.exp(-np.einsum("ki,ij,kj->k", off, curvature, off) / 2)
         down, across, found = newton(powers, 0.2, 0.0 if mixed is None else mixed)
-        assert found == pytest.approx(-bend[0][1], abs=1e-9)
+        assert found == pytest.approx(-curvature[0][1], abs=1e-9)
         return [down, across]
 
     for top in ((0.31, -0.22), (-0.17, -0.35)):
-        assert moved(top, np.array(bend)) == pytest.approx(top, abs=1e-9)
-        assert moved(top, np.array(bend), -bend[0][1]) == pytest.approx(top, abs=1e-9)
+        assert moved(top, np.array(curvature)) == pytest.approx(top, abs=1e-9)
+        assert moved(top, np.array(curvature), -curvature[0][1]) == pytest.approx(top, abs=1e-9)
     assert moved((0.3, -0.3), -np.eye(2)) == [-0.2, 0.2]  # of a valley
     for far in ((4.3, -5.1), (-2.9, 3.7)):
         assert moved(far, np.eye(2)) == pytest.approx(0.6 * np.sign(far), abs=1e-9)

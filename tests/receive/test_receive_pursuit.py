@@ -25,7 +25,7 @@ FEW = replace(ANTENNAS, rx_x=3, rx_z=3)
 W = Waveform(num_samples=256, num_groups=1)
 
 
-def heard(paths: list[Path], method: str, noise: float, seed: int = 5):
+def received(paths: list[Path], method: str, noise: float, seed: int = 5):
     schedule = pseudo_random_schedule(1, W.num_chirps, 3, np.random.default_rng(seed))
     payload = random_payload(W, schedule, 8, np.random.default_rng(seed + 1))
     signal = cube(W, schedule, payload, paths, FEW, noise=noise, seed=seed)
@@ -43,14 +43,14 @@ def test_a_weak_path_in_the_row_of_a_strong_one(ratio_db: float):
         Path(2 * strong[0], 2 * strong[1], amplitude, u, u),
         Path(2 * weak[0], 2 * weak[1], 1.0, v, v),
     ]
-    d = heard(paths, "auto", noise=1.0)
+    d = received(paths, "auto", noise=1.0)
     assert len(d) == 2
     for i, (r, rate) in enumerate((strong, weak)):
         assert abs(d.range[i] - r) < 0.1 * W.range_cell(2) and abs(
             d.velocity[i] - rate
         ) < 0.1 * W.velocity_cell(2)
     assert np.abs(d.direction[1] - v).max() < 0.05
-    plain = heard(paths, "omp", noise=1.0)
+    plain = received(paths, "omp", noise=1.0)
     assert not (np.abs(plain.velocity - weak[1]) < W.velocity_cell(2)).any()
 
 
@@ -68,7 +68,7 @@ def test_a_path_is_taken_out_whole_and_put_back(passes: int):
     chirps = known(W, schedule, payload, FEW, passes)
     spectra = clean_spectrum(cube(W, schedule, payload, [path], FEW), chirps, 128)
     k = 2 * np.pi * W.effective_carrier / SPEED_OF_LIGHT
-    sent, heard = (
+    sent, received = (
         np.exp(1j * k * places[:, [0, 2]] @ u)
         for places, u in (
             (FEW.tx_positions, np.array(path.departure)),
@@ -79,9 +79,9 @@ def test_a_path_is_taken_out_whole_and_put_back(passes: int):
     delay, rate = 43.817 / SPEED_OF_LIGHT, 21.3 / SPEED_OF_LIGHT
     exact = Estimate(delay, rate, near.respond(delay, rate))
     turned = (
-        exact.channels * np.outer(sent, heard).conj()
+        exact.channels * np.outer(sent, received).conj()
         if passes == 2
-        else exact.channels * heard.conj()
+        else exact.channels * received.conj()
     )
     assert np.abs(np.abs(turned) - abs(path.amplitude)).max() < 0.02
     left, whole = spectra.copy(), _Path(exact, 1.0, 1.0)
@@ -107,9 +107,13 @@ def test_noise_and_one_path_are_left_as_they_are():
     """No remainder of a path 50 dB over the noise of a sample is reported, and nothing in noise
     alone."""
     for seed in range(2):
-        assert len(heard([], "auto", 1.0, seed)) == 0
+        assert len(received([], "auto", 1.0, seed)) == 0
         assert (
-            len(heard([Path(2 * 13.31, -17.7, 10**2.5, (0.6, 0.3), (0.6, 0.3))], "auto", 1.0, seed))
+            len(
+                received(
+                    [Path(2 * 13.31, -17.7, 10**2.5, (0.6, 0.3), (0.6, 0.3))], "auto", 1.0, seed
+                )
+            )
             == 1
         )
 

@@ -152,7 +152,7 @@ def test_timing_errors_are_tolerated_as_the_beats_say(cells):
     delay = cells * W.delay_step
     for spacing, error in ((1, -(limit + delay)), (-1, 2 * limit - delay)):
         outwards = 1 if spacing == 1 else -1
-        kept, heard = (
+        kept, answers = (
             isolation(
                 W,
                 spacing,
@@ -167,7 +167,7 @@ def test_timing_errors_are_tolerated_as_the_beats_say(cells):
         assert kept > 25
         # the reference power is that of the own block, whose beat 2 cells from the band's edge
         # rings a little
-        assert heard == pytest.approx(0, abs=0.5)
+        assert answers == pytest.approx(0, abs=0.5)
     away = isolation(
         W,
         1,

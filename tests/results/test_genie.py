@@ -82,7 +82,7 @@ def test_the_matched_filter_of_losses_is_one():
     for link in (Link("AT", "AT"), Link("AT", "PT2")):
         terminal = standard_terminal(setup, link, scenario)
         observer = Station(setup, link, terminal, scenario.receivers)
-        record = observer.record(frame, observer.receive(frame, frame.heard(link), False))
+        record = observer.record(frame, observer.receive(frame, frame.received(link), False))
         paths = frame.paths[link]
         for i in np.flatnonzero(np.isfinite(record.target_snr)):
             name = list(setup.swarm.uavs)[i]

@@ -76,12 +76,12 @@ def test_the_strongest_path_within_a_cell_wins():
         points=np.zeros((4, 3, 3)),
     )
     rows = [[20.05, 1.02, 0, 0], [33.1, 3.1, 0, 0], [47.0, 0.6, 0, 0], [19.8, 0.9, 0, 0]]
-    kind, target, order, face, skirt = explain(detections(rows), found, WAVEFORM, 2, 100.0)
+    kind, target, order, face, sidelobe = explain(detections(rows), found, WAVEFORM, 2, 100.0)
     assert kind.tolist() == [PathKind.SPECULAR, PathKind.GHOST, -1, PathKind.TARGET]
     assert target.tolist() == [-1, 2, -1, 0]
     assert order.tolist() == [1, 2, -1, 0]
     assert face.tolist() == [41, 17, -1, -1]
-    assert not skirt.any()
+    assert not sidelobe.any()
 
 
 def test_direction_tells_a_weak_path_from_a_strong_one():
@@ -119,7 +119,7 @@ def test_direction_tells_a_weak_path_from_a_strong_one():
         (PathKind.DIFFUSE, -1),
         strong,
     ]
-    assert not any(f.skirt[0] for f in found)
+    assert not any(f.sidelobe[0] for f in found)
 
 
 @pytest.mark.parametrize(("scatterers", "kind"), [(3, PathKind.TARGET), (5, PathKind.DIFFUSE)])
@@ -155,7 +155,7 @@ def test_skirts_of_strong_paths_are_theirs():
     ]
     found = explain(detections(rows), strong, WAVEFORM, 2, 1e6)
     assert found.kind.tolist() == [PathKind.LEAKAGE, PathKind.LEAKAGE, -1, PathKind.LEAKAGE]
-    assert found.skirt.tolist() == [True, True, False, False]
+    assert found.sidelobe.tolist() == [True, True, False, False]
 
 
 def test_an_echo_in_its_place_is_not_the_skirt_of_a_line_from_elsewhere():
@@ -172,7 +172,7 @@ def test_an_echo_in_its_place_is_not_the_skirt_of_a_line_from_elsewhere():
         for u in ((0.08, 0.24), (0.22, 0.08))
     ]
     assert [f.kind[0] for f in found] == [PathKind.TARGET, PathKind.LEAKAGE]
-    assert [f.skirt[0] for f in found] == [False, True]
+    assert [f.sidelobe[0] for f in found] == [False, True]
 
 
 def test_the_resampling_of_the_groups_leaves_a_floor():
@@ -268,7 +268,7 @@ def plainly(detections, paths, waveform, passes, cell_gain, aim=None) -> Explana
             continue
         cause = some[best]
         out.kind[q], out.target[q] = paths.kind[cause], paths.target[cause]
-        out.order[q], out.skirt[q] = paths.bounces[cause], not near[best]
+        out.order[q], out.sidelobe[q] = paths.bounces[cause], not near[best]
         met = paths.faces[cause][paths.faces[cause] >= 0]
         out.face[q] = met[0] if met.size else -1
     return out
@@ -321,6 +321,6 @@ def test_causes_are_those_of_a_plain_loop(looks):
             assert mine.dtype == plain.dtype
             assert mine.tolist() == plain.tolist()
         explained += int((mine >= 0).sum())
-        skirts += int(explain(*asked).skirt.sum())
+        skirts += int(explain(*asked).sidelobe.sum())
     assert explained > 300
     assert skirts > 50

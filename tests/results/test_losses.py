@@ -236,7 +236,7 @@ TRUTHS = {
 }
 
 
-def judge(**changed) -> Loss:
+def test_cells(**changed) -> Loss:
     v = STRONG | changed
     chance = Chance(v["matched"], v["cell"], v["clutter"], v["background"], v["masked"])
     return cause_of(v["hit"], v["own"], np.array(v["beside"], int), chance, SEES, v["read"])
@@ -246,7 +246,7 @@ def judge(**changed) -> Loss:
 def test_of_two_causes_the_first_counts(first, second):
     """Every cause alone and before every later one. Planted bug: masked asked before noise."""
     both = TRUTHS[max(first, second)] | TRUTHS[min(first, second)]
-    assert judge(**both) is min(first, second)
+    assert test_cells(**both) is min(first, second)
 
 
 @pytest.mark.parametrize(
@@ -260,7 +260,7 @@ def test_of_two_causes_the_first_counts(first, second):
 )
 def test_clutter_in_the_cell_or_around_it(changed, loss):
     """Ten times the noise stands out of a background of 1 + 1.3, and not of 1 + 9."""
-    assert judge(**changed) is loss
+    assert test_cells(**changed) is loss
 
 
 @pytest.mark.parametrize(
@@ -275,7 +275,7 @@ def test_clutter_in_the_cell_or_around_it(changed, loss):
 )
 def test_taken_for_something_else(beside, loss):
     """A detection in the UAV's cell that another path explains."""
-    assert judge(beside=beside) is loss
+    assert test_cells(beside=beside) is loss
 
 
 def test_what_a_matched_filter_and_a_beam_would_find():

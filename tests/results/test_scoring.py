@@ -16,7 +16,7 @@ from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections, Reception
 from isac_rt.results.losses import Loss
-from isac_rt.results.scoring import Heard, Scorer
+from isac_rt.results.scoring import LinkResult, Scorer
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import swarm_of, timetable_of
@@ -141,7 +141,7 @@ def scored(scorer, frame, paths, points=(), tracks=(), **reception):
         name="AT", pose=pose, antennas=ANTENNAS, schedule=TIMETABLE.schedule, payload=payload
     )
     received = replace(Reception.undecoded(W, detections(points)), **reception)
-    heard = Heard(received, track_set(receiver, frame, tracks), 1)
+    heard = LinkResult(received, track_set(receiver, frame, tracks), 1)
     return scorer.record(frame, pathset(receiver, paths), sent, heard, NOISE)
 
 
@@ -273,7 +273,7 @@ def test_tracks_are_judged_by_what_feeds_them():
     it, one of U1. While it coasts a track keeps the label of its latest detection; when the wall
     feeds the track it follows nobody. Planted bugs: the nearest track follows; the label of the
     frame's first detection; the label of a coasting track forgotten."""
-    judge = scorer("AT")
+    test_cells = scorer("AT")
 
     def step(frame, fed, labels):
         """`fed`: row of each track's detection; `labels`: kinds of the paths behind the rows."""
@@ -283,17 +283,17 @@ def test_tracks_are_judged_by_what_feeds_them():
         points = [point("AT", "U1", frame, places[label]) for label in labels]
         tracks = [(11, False, fed[1], "U1", 0.0)] * (frame == DATA)
         tracks += [(4, True, fed[0], "U1", 0.1), (9, True, fed[1], "U1", 0.9)]
-        return scored(judge, frame, rows, points, tracks).tracks
+        return scored(test_cells, frame, rows, points, tracks).tracks
 
     first = step(DATA, (1, 0), ["echo", "wall"])
     assert first.uav.tolist() == [-1, -1, 0]
     assert first.kind.tolist() == [PathKind.TARGET, PathKind.DIFFUSE, PathKind.TARGET]
     assert first.target.tolist() == [0, -1, 0]
     assert step(DATA + 1, (-1, -1), []).uav.tolist() == [-1, 0]
-    assert list(judge.state.labels) == [4, 9]
+    assert list(test_cells.state.labels) == [4, 9]
     again = scorer("AT")
-    again.restore(judge.memory())
-    judge = again
+    again.restore(test_cells.memory())
+    test_cells = again
     assert step(DATA + 2, (0, -1), ["echo"]).uav.tolist() == [-1, 0]
     assert step(DATA + 3, (0, 1), ["echo", "wall"]).uav.tolist() == [0, -1]
 
@@ -315,14 +315,14 @@ def test_targets_are_scored_without_the_terminals():
     frame, and a wall's track at U2, who is not in view: of all there is one false track, of targets
     alone likewise, and PT1's is neither found nor false. The bounds are those of 20 dB and more.
     Planted bugs: the terminal's track counts as false; its label forgotten as it coasts."""
-    judge = scorer("AT")
+    test_cells = scorer("AT")
     for frame, fed in ((DATA, (0, 1, 2)), (DATA + 1, (-1, -1, -1))):
         rows = [path_of("AT", "U1", frame, 3.0), path_of("AT", "PT1", frame, 3.0)]
         rows += [path_of("AT", "U2", frame, 3.0, PathKind.DIFFUSE)]
         points = [point("AT", name, frame) for name in ("U1", "PT1", "U2")] if fed[0] == 0 else []
         names = zip((4, 5, 6), fed, ("U1", "PT1", "U2"), (0.3, 2.0, 0.0), strict=True)
         tracks = [(number, True, row, name, east) for number, row, name, east in names]
-        record = scored(judge, frame, rows, points, tracks)
+        record = scored(test_cells, frame, rows, points, tracks)
         assert record.cooperative.tolist() == [False, True, True, False]
         assert record.gospa[1:] == pytest.approx((4.09, 0.0, 12.5))
         assert record.gospa_targets[1:] == pytest.approx((0.09, 0.0, 12.5))
@@ -338,22 +338,22 @@ def test_an_alias_or_a_drifted_track_does_not_stand_for_a_uav():
     assert record.detection_kind.tolist() == [PathKind.TARGET]
     assert np.isnan(record.detected.range).all()
     assert record.loss[0] == Loss.INACCURATE
-    judge = scorer("AT")
+    test_cells = scorer("AT")
     tracks = [(1, True, 0, "U2", 0.0)]
     rows = [path_of("AT", "U1", DATA, 30.0)]
-    record = scored(judge, DATA, rows, [point("AT", "U1", DATA)], tracks)
+    record = scored(test_cells, DATA, rows, [point("AT", "U1", DATA)], tracks)
     assert record.tracks.kind.tolist() == [PathKind.TARGET]
     assert record.tracks.uav.tolist() == [-1]
 
 
 def test_of_two_tracks_the_one_that_followed_goes_on():
     """Another track of U1 that is nearer does not take over while the first one lives."""
-    judge = scorer("AT")
+    test_cells = scorer("AT")
     rows = {f: [path_of("AT", "U1", f, 30.0)] for f in (DATA, DATA + 1)}
     found = {f: [point("AT", "U1", f)] * 2 for f in rows}
-    scored(judge, DATA, rows[DATA], found[DATA], [(7, True, 0, "U1", 0.0)])
+    scored(test_cells, DATA, rows[DATA], found[DATA], [(7, True, 0, "U1", 0.0)])
     tracks = [(3, True, 0, "U1", 0.0), (7, True, 1, "U1", 0.0)]
-    record = scored(judge, DATA + 1, rows[DATA + 1], found[DATA + 1], tracks)
+    record = scored(test_cells, DATA + 1, rows[DATA + 1], found[DATA + 1], tracks)
     assert record.tracks.uav.tolist() == [-1, 0]
     assert record.tracked.range[0] == record.tracks.range[1]
     assert np.isnan(record.tracked.range[1:]).all()
@@ -381,8 +381,8 @@ def test_what_is_outside_the_view_or_bent_is_not_asked_for():
     with a path counts wherever it is; bent paths count."""
     rows = [path_of("AT", "U1", DATA, 30.0)]
     narrow = replace(ANTENNAS, half_view=0.05)
-    judge = Scorer(Link("AT", "AT"), narrow, SWARM, TIMETABLE, Receivers())
-    record = scored(judge, DATA, rows)
+    test_cells = Scorer(Link("AT", "AT"), narrow, SWARM, TIMETABLE, Receivers())
+    record = scored(test_cells, DATA, rows)
     assert (record.in_view[0], record.shadowed[0], record.loss[0]) == (False, False, -1)
     pose = SWARM.poses(TIMETABLE.epoch(DATA))["AT"]
     sent = Transmission(
@@ -392,7 +392,7 @@ def test_what_is_outside_the_view_or_bent_is_not_asked_for():
         schedule=TIMETABLE.schedule,
         payload=TIMETABLE.payload("AT", DATA),
     )
-    heard = Heard(Reception.undecoded(W, detections([])), track_set("AT", DATA, []), 1)
+    heard = LinkResult(Reception.undecoded(W, detections([])), track_set("AT", DATA, []), 1)
     bent = pathset("AT", rows, np.ones((1, 2, 3)))
     record = scorer("AT").record(DATA, bent, sent, heard, NOISE)
     assert (record.in_view[0], record.shadowed[0], record.loss[0]) == (True, True, -1)
@@ -414,9 +414,9 @@ def test_streams_and_blocks():
     table = timetable_of(
         SCENARIO.model_copy(update={"swarm": uavs, "modulation": streams}), W, TIMETABLE.schedule
     )
-    judge = Scorer(Link("AT", "PT1"), ANTENNAS, SWARM, table, Receivers())
+    test_cells = Scorer(Link("AT", "PT1"), ANTENNAS, SWARM, table, Receivers())
     sight = {f: [path_of("PT1", "AT", f, 3.0)] for f in (0, DATA)}
-    found = {f: scored(judge, f, paths) for f, paths in sight.items()}
+    found = {f: scored(test_cells, f, paths) for f, paths in sight.items()}
     assert found[0].target_snr[1] == pytest.approx(9 * MATCHED)
     assert found[DATA].target_snr[1] == pytest.approx(3 * MATCHED)
     later = SWARM.poses(TIMETABLE.epoch(DATA) + 3 * 2 * W.max_delay)

@@ -16,7 +16,7 @@ from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.kernels.fourier import ROW, plan, transform
-from isac_rt.kernels.signal_covered import LINES, TOGETHER, batches, covered_error
+from isac_rt.kernels.signal_below_noise import LINES, TOGETHER, batches, below_noise_error
 from isac_rt.kernels.signal_direct import add_direct
 from isac_rt.kernels.signal_gridded import (
     GRIDDED_ERROR,
@@ -242,7 +242,7 @@ def test_error_of_paths_that_noise_covers(speed, size, change):
         tx_delay=size * t.tx_delay,
         rx_delay=size * t.rx_delay,
     )
-    bound = covered_error(w, t, grid_size(w.num_samples, OVERSAMPLING, WIDTH))
+    bound = below_noise_error(w, t, grid_size(w.num_samples, OVERSAMPLING, WIDTH))
     found = np.zeros(count)
     for k in range(count):
         one = t.select(np.arange(count) == k)
@@ -272,7 +272,7 @@ def test_covered_paths_near_each_other_and_far_apart():
     line = 1 / (w.slope * w.sample_interval * size * LINES)
     gaps = line * 10 ** np.random.default_rng(29).uniform(-1.0, 1.7, count)
     t = t._replace(delay=0.05 * w.max_delay + gaps.cumsum(), begin=np.full(count, -np.inf))
-    bound = covered_error(w, t, size).max()
+    bound = below_noise_error(w, t, size).max()
     assert relative(gridded(w, t, np.ones(count, bool)), exact(w, t)) < bound
 
 

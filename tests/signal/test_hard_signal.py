@@ -111,8 +111,8 @@ def test_beyond_the_filter_there_is_nothing(method, delay):
     block such a path may be heard: here there is one group. Written against: the skirt of twice the
     width."""
     w = Waveform(num_samples=64, num_chirps=6, num_groups=1)
-    skirt = 1.01 * stage.SKIRT / w.slope
-    tau = -skirt if delay < 0 else delay * w.max_delay if delay > 1.5 else w.max_delay + skirt
+    sidelobe = 1.01 * stage.SKIRT / w.slope
+    tau = -sidelobe if delay < 0 else delay * w.max_delay if delay > 1.5 else w.max_delay + sidelobe
     assert not samples(w, paths(w, tau), method, antennas=stage.arrays(w, tx_z=2)).any()
 
 

@@ -61,10 +61,10 @@ def test_what_noise_covers_is_decided_cell_by_cell():
     power = np.where(np.arange(64) < 32, 1e-9, 1e-6)
     t = t._replace(delay=delay, power=power)
     size = float(3 * 15 * 6 * 1024)
-    from isac_rt.kernels.signal_covered import covered_error
+    from isac_rt.kernels.signal_below_noise import below_noise_error
     from isac_rt.kernels.signal_gridded import OVERSAMPLING, WIDTH, grid_size
 
-    error = covered_error(w, t, grid_size(w.num_samples, OVERSAMPLING, WIDTH))
+    error = below_noise_error(w, t, grid_size(w.num_samples, OVERSAMPLING, WIDTH))
     sums = [(power * error**2)[some].sum() for some in (slice(0, 32), slice(32, 64))]
     for share, covered in ((0.5 * sums[0], 0), (2 * sums[0], 32), (2 * sums[1], 64)):
         method = Auto(noise_power=1.0, covered=share * size, max_direct=0)

@@ -52,8 +52,8 @@ def misfit(
     truth = cube(
         w, schedule, payload, [Path(passes * reach, passes * speed, 1.0, aside, aside)], ONE
     ).samples
-    heard = np.abs(model) > 0.5  # the rest is filtered away
-    x, y = model[heard].astype(complex), truth[heard].astype(complex)
+    received_tones = np.abs(model) > 0.5  # the rest is filtered away
+    x, y = model[received_tones].astype(complex), truth[received_tones].astype(complex)
     return float(np.sqrt(1 - abs(np.vdot(x, y)) ** 2 / (np.vdot(x, x).real * np.vdot(y, y).real)))
 
 

@@ -9,7 +9,7 @@ import pytest
 from talking import scenario
 
 from isac_rt.document import ScenarioError
-from isac_rt.extensions.city_receivers import standing
+from isac_rt.extensions.city_receivers import static_clutter as standing
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare

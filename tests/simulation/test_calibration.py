@@ -40,7 +40,7 @@ def scene(tmp_path):
 
 def heard(scene, *changes):
     setup = irt.prepare(irt.load(scene, changes))
-    return setup, setup.frame(0).heard(("A", "A"))
+    return setup, setup.frame(0).received(("A", "A"))
 
 
 def apart_db(a, b):

@@ -59,9 +59,9 @@ def test_every_frame_is_synthesised_once_for_all_sets(monkeypatch):
     scenario = load(SCENES / "paper_swarm_consistent.yaml", SHORT + SETS, frames=3)
     setup, heard = prepare(scenario), []
     frames = type(setup.frame(0))
-    make = frames.heard
+    make = frames.received
     monkeypatch.setattr(
-        frames, "heard", lambda self, link: heard.append((self.number, link)) or make(self, link)
+        frames, "received", lambda self, link: heard.append((self.number, link)) or make(self, link)
     )
     simulate.run(scenario, setup=setup)
     assert sorted(heard) == sorted((k, link) for k in range(3) for link in setup.timetable.links(k))

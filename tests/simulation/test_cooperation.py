@@ -7,7 +7,7 @@ import pytest
 from talking import scenario
 from test_resume import Stopped, assert_equal_results, stopping_at
 
-from isac_rt.extensions.cooperation.swarm import look_of
+from isac_rt.extensions.cooperation.swarm import scan_of
 from isac_rt.frame.access import Access
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
@@ -15,7 +15,7 @@ from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections, Reception
 from isac_rt.results.dataset import fused_positions
 from isac_rt.results.provenance import run_content
-from isac_rt.results.scoring import Heard
+from isac_rt.results.scoring import LinkResult
 from isac_rt.results.swarm import SWARM
 from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.simulation import simulate
@@ -44,12 +44,14 @@ def pooled():
 def test_nothing_else_of_a_run_depends_on_what_is_told(talked, pooled):
     """The same bits. Planted bug: a picture's track that updates a terminal's tracker."""
     alone = simulate.run(scenario(cooperation="none"), snapshots=2)
-    for told in (talked, pooled):
+    for reported_to in (talked, pooled):
         for name, variable in alone.dataset.variables.items():
             kind = variable.dtype.kind == "f"
-            assert np.array_equal(told.dataset[name].values, variable.values, equal_nan=kind), name
+            assert np.array_equal(
+                reported_to.dataset[name].values, variable.values, equal_nan=kind
+            ), name
         for key in ("terminals", "links", "paths"):
-            assert told.summary[key] == alone.summary[key]
+            assert reported_to.summary[key] == alone.summary[key]
     assert alone.summary["swarm"] is None
 
 
@@ -59,7 +61,7 @@ def test_detections_are_heard_as_the_links_carry_them(pooled):
     tracks 16 and 165; the newest frame's fit and no other's. The feedback has 1000. Planted
     bugs: what a pilot carries; bits of lost messages left out."""
     d, p = pooled.dataset, pooled.summary["swarm"]["terminals"]
-    k = list(d.picture.values).index("PT")
+    k = list(d.fused_tracks.values).index("PT")
     assert d.picture_room.values[:, k].tolist() == [0, 0] + [886] * 7
     assert d.picture_reports.values[:3, k].tolist()[:2] == [0, 0]
     assert (d.picture_reports.values[3:, k] > 0).all()
@@ -105,9 +107,9 @@ def test_who_hears_what_and_when(talked):
     track to tell. Planted bugs: a message that arrives with the frame it is made after; a code
     that costs nothing."""
     d = talked.dataset
-    heard = {"AT": ([1] * 6, [0.02] * 6), "PT": ([1, 2, 2, 2, 2, 2], [0.02] + [0.03] * 5)}
-    for name, (count, age) in heard.items():
-        p = list(d.picture.values).index(name)
+    received = {"AT": ([1] * 6, [0.02] * 6), "PT": ([1, 2, 2, 2, 2, 2], [0.02] + [0.03] * 5)}
+    for name, (count, age) in received.items():
+        p = list(d.fused_tracks.values).index(name)
         assert d.picture_reports.values[:, p].tolist() == [0] * 3 + count
         assert np.allclose(d.picture_age.values[3:, p], age)
 
@@ -139,20 +141,22 @@ def test_a_terminal_that_does_not_decode_hears_nothing():
     swarm = {**scenario().swarm, "PT": deaf}
     known: dict = {}
     results = simulate.run(scenario(swarm=swarm, frames=6), terminal=noting(known))
-    heard = results.summary["swarm"]["terminals"]
+    received = results.summary["swarm"]["terminals"]
     for name in ("AT", "PT"):
-        assert heard[name]["messages"] == heard[name]["messages_lost"] > 0
-        assert heard[name]["reports_per_frame"] == 0
+        assert received[name]["messages"] == received[name]["messages_lost"] > 0
+        assert received[name]["reports_per_frame"] == 0
     assert len(known["AT->AT"]) == 6
-    assert not [b for told in known.values() for bodies in told for b in bodies if b.terminal]
+    assert not [
+        b for reported_to in known.values() for uavs in reported_to for b in uavs if b.terminal
+    ]
 
 
-@pytest.mark.parametrize("told", ["tracks", "detections"])
-def test_a_stopped_run_goes_on_to_the_same_pictures(told, tmp_path):
+@pytest.mark.parametrize("reported_to", ["tracks", "detections"])
+def test_a_stopped_run_goes_on_to_the_same_pictures(reported_to, tmp_path):
     """Also of a set that is compared. Planted bugs: the channels, the names or what fed the tracks
     not taken up."""
     other = {"other": ReceiverSet(receivers=Receivers(), tracking=Tracking(confirm_hits=2))}
-    flight = scenario(frames=7, compare=other, cooperation=told)
+    flight = scenario(frames=7, compare=other, cooperation=reported_to)
     whole = simulate.run(flight, snapshots=2)
     for stop in (3, 5, None):
         resume = Resume(tmp_path, run_content(flight, 2), every=0.0)
@@ -168,9 +172,9 @@ def test_the_report_and_the_moving_picture_show_the_pictures(talked):
     table = swarm_table(talked.summary)
     assert [row[0] for row in table.rows] == ["Whole swarm", "AT", "PT"]
     assert table.rows[2][-1].startswith("0 of ")
-    told = talked.summary["swarm"]["terminals"]["PT"]
-    assert table.rows[2][-3] == str(told["left_out"]) and told["left_out"] > 0
-    assert told["bits"] < told["bits_room"] == 886 * 7
+    reported_to = talked.summary["swarm"]["terminals"]["PT"]
+    assert table.rows[2][-3] == str(reported_to["left_out"]) and reported_to["left_out"] > 0
+    assert reported_to["bits"] < reported_to["bits_room"] == 886 * 7
     d = talked.dataset
     corners, faces = np.eye(3), np.array([[0, 1, 2]])
     roof = CityMesh("roof", corners, faces, np.zeros(1, np.int16), (), np.zeros(3))
@@ -178,8 +182,8 @@ def test_the_report_and_the_moving_picture_show_the_pictures(talked):
     for name in ("AT", "PT", SWARM):
         (found,) = fused_positions(d, 8, name)
         assert np.linalg.norm(found - d.uav_position.values[8, 2]) < 1.0
-        bodies = {trace["name"]: trace for trace in scene["frames"][8]["data"]}
-        shown = bodies["fused tracks of the swarm" if name == SWARM else f"fused tracks of {name}"]
+        uavs = {trace["name"]: trace for trace in scene["frames"][8]["data"]}
+        shown = uavs["fused tracks of the swarm" if name == SWARM else f"fused tracks of {name}"]
         assert [shown[a] for a in "xyz"] == np.round(found, 2)[:, None].tolist()
     alone = d.drop_vars([name for name in d.variables if name == "picture"])
     assert fused_positions(alone, 8, SWARM).shape == (0, 3)
@@ -211,13 +215,15 @@ def test_a_reference_is_not_told_as_a_detection():
         starts=np.ones(2, bool),
     )
     waveform = Waveform(num_samples=256)
-    heard = Heard(Reception.undecoded(waveform, found), track_set(tracks[:1], own, tracks[1]), 1)
-    look = look_of(Link("AT", "PT1"), 3, 0.15, own, heard, 0.0)
-    assert look.numbers.tolist() == [0] and look.kept == (0,)
-    np.testing.assert_allclose(look.z, z[1:])
+    received = LinkResult(
+        Reception.undecoded(waveform, found), track_set(tracks[:1], own, tracks[1]), 1
+    )
+    scan = scan_of(Link("AT", "PT1"), 3, 0.15, own, received, 0.0)
+    assert scan.numbers.tolist() == [0] and scan.kept == (0,)
+    np.testing.assert_allclose(scan.z, z[1:])
 
 
-def noting(told):
+def noting(reported_to):
     """Makes standard terminals that put down by link what they are told."""
 
     def terminal(setup, link):
@@ -225,7 +231,7 @@ def noting(told):
         step = made.step
 
         def noted(*given, **options):
-            told.setdefault(str(link), []).append(options["told"])
+            reported_to.setdefault(str(link), []).append(options["reports"])
             return step(*given, **options)
 
         made.step = noted
@@ -243,17 +249,17 @@ def test_terminals_are_told_of_everybody_but_themselves_and_their_transmitter(tm
     whole, resumed = {}, {}
     simulate.run(flight, snapshots=0, terminal=noting(whole))
     swarm = simulate.prepare(flight).swarm
-    for link, told in whole.items():
-        assert len(told) == flight.frames and not told[0]
+    for link, reported_to in whole.items():
+        assert len(reported_to) == flight.frames and not reported_to[0]
         poses = swarm.poses((flight.frames - 1) * flight.frame_interval_s)
         away = {
-            n: [np.linalg.norm(body.state.mean[:3] - p.position) for body in told[-1]]
+            n: [np.linalg.norm(uav.state.mean[:3] - p.position) for uav in reported_to[-1]]
             for n, p in poses.items()
         }
         assert min(away["U"]) < 0.03
         ends = set(link.split("->"))
         assert all(min(away[name]) > 3 for name in ends)
-        assert [b.terminal for b in told[-1] if b.terminal] == sorted({"AT", "PT"} - ends)
+        assert [b.terminal for b in reported_to[-1] if b.terminal] == sorted({"AT", "PT"} - ends)
 
     def kept():
         return Resume(tmp_path, run_content(flight, 0), every=0.0)
@@ -261,10 +267,10 @@ def test_terminals_are_told_of_everybody_but_themselves_and_their_transmitter(tm
     with pytest.raises(Stopped):
         simulate.run(flight, snapshots=0, resume=kept(), progress=stopping_at(4))
     simulate.run(flight, snapshots=0, resume=kept(), terminal=noting(resumed))
-    for link, told in resumed.items():
-        assert 0 < len(told) < flight.frames
-        for again, before in zip(told[::-1], whole[link][::-1], strict=False):
-            assert [body.terminal for body in again] == [body.terminal for body in before]
+    for link, reported_to in resumed.items():
+        assert 0 < len(reported_to) < flight.frames
+        for again, before in zip(reported_to[::-1], whole[link][::-1], strict=False):
+            assert [uav.terminal for uav in again] == [uav.terminal for uav in before]
             for one, other in zip(again, before, strict=True):
                 assert np.array_equal(one.state.mean, other.state.mean)
                 assert np.array_equal(one.state.covariance, other.state.covariance)

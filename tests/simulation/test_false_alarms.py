@@ -38,7 +38,7 @@ class Counter:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.counts, self.false = np.zeros((2, 3), int), 0
-        passive, active = bistatic.BeamSearch._judge, angle_doppler.AngleDoppler._judge
+        passive, active = bistatic.BeamSearch._test, angle_doppler.AngleDoppler._test
 
         def noting(search, maps, noise, expected, known, clutter, left_over):
             self.seen = known.waveform, expected / noise, left_over.power > 0, clutter is not None
@@ -48,13 +48,13 @@ class Counter:
             self.seen = known.waveform, expected / noise, np.zeros(power.shape, bool), True
             return active(detector, maps, power, noise, expected, known, clutter)
 
-        monkeypatch.setattr(bistatic.BeamSearch, "_judge", noting)
-        monkeypatch.setattr(angle_doppler.AngleDoppler, "_judge", noting_own)
+        monkeypatch.setattr(bistatic.BeamSearch, "_test", noting)
+        monkeypatch.setattr(angle_doppler.AngleDoppler, "_test", noting_own)
 
     def look(self, observer: Station, frame) -> None:
         """Count a frame."""
         self.seen = None
-        heard = observer.receive(frame, frame.heard(observer.link), False)
+        heard = observer.receive(frame, frame.received(observer.link), False)
         tracks = observer.record(frame, heard).tracks
         self.false += int((tracks.confirmed & (tracks.uav < 0)).sum())
         if self.seen is None or not self.seen[3]:

@@ -341,9 +341,9 @@ def test_everything_leaves_nothing_out():
 
 @pytest.mark.sionna
 def test_knots_lie_as_far_apart_as_the_plan_says():
-    """Along waypoints no terminal flies farther between two knots than the limit, nor much less;
-    the preset everything has none. Planted bug: the flight's own spacing."""
-    from isac_rt.propagation.clutter.sight import Flight
+    """Along waypoints no terminal flies farther between two time samples than the limit, nor much
+    less; the preset everything has none. Planted bug: the flight's own spacing."""
+    from isac_rt.propagation.clutter.visibility import Flight
 
     plan = plan_of("munich_swarm.yaml", "accuracy.max_untraced_m=1.7")
     assert plan.max_untraced == 1.7

@@ -155,10 +155,10 @@ def test_feedback_goes_to_the_links_own_active_terminal(monkeypatch):
         assert time == pytest.approx(0.05 * number + later + w.frame_duration / 2, abs=1e-15)
         assert reported is kept.tracks[link][number]
         assert own is kept.tracks[Link(link.tx, link.tx)][number // 2]
-    told = run.summary["access"]["feedback"]
-    assert told["B->P"] == {"answers": 3, "corrections": 3}
-    assert told["A->P"] == {"answers": 3, "corrections": 0}
-    assert told["A->Q"] == {"answers": 0, "corrections": 0}
+    reports = run.summary["access"]["feedback"]
+    assert reports["B->P"] == {"answers": 3, "corrections": 3}
+    assert reports["A->P"] == {"answers": 3, "corrections": 0}
+    assert reports["A->Q"] == {"answers": 0, "corrections": 0}
     assert [(link, cells) for link, cells, _ in kept.shortened] == [(("B", "P"), 3)] * 3
     for (_, _, own), number in zip(kept.shortened, (0, 2, 4), strict=True):
         time = 0.05 * number + 10 * w.max_delay + w.frame_duration / 2
@@ -178,17 +178,17 @@ def test_the_stages_before_the_data_are_given_the_scenario(monkeypatch):
         name: uav.model_copy(update={"clock_offset_s": 1e-8 * i, "clock_drift_ppm": 0.01 * i})
         for i, (name, uav) in enumerate(scenario().swarm.items())
     }
-    told: list[Any] = []
+    reports: list[Any] = []
 
     def establish(network):
-        told.append(network)
+        reports.append(network)
         return Establishment({"A": 0, "B": None}, {}, {}, {}, 0, 0, 0, 0, 1, 0.1)
 
     monkeypatch.setattr(protocol, "establish", establish)
     access = Access(establish=True, synchronisation="two_round")
     s = scenario(swarm=drifting, access=access, modulation=Modulation(acquisition_frames=2))
     setup = prepare(s)
-    (n,) = told
+    (n,) = reports
     w = setup.waveform
     frames = 2 * (2 * -(-w.num_resource_blocks // 3) + 1 + 2)
     assert n.longest == pytest.approx(frames * w.frame_duration)
@@ -210,7 +210,7 @@ def test_the_stages_before_the_data_are_given_the_scenario(monkeypatch):
         assert n.noise_power[name] == pytest.approx(echo / 10**0.3, rel=1e-6, abs=0)
     assert setup.timetable.blocks == {"A": 0, "B": None}
     prepare(s.model_copy(update={"access": replace_access(access)}))
-    assert told[1].external_clock and told[1].clocks == {}
+    assert reports[1].external_clock and reports[1].clocks == {}
 
 
 def replace_access(access: Access) -> Access:

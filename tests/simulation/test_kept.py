@@ -13,7 +13,7 @@ import pytest
 from isac_rt import load, runtime
 from isac_rt.plain import plain
 from isac_rt.propagation.clutter import field as clutter_field
-from isac_rt.propagation.clutter import sight
+from isac_rt.propagation.clutter import visibility as sight
 from isac_rt.propagation.clutter.field import in_local
 from isac_rt.simulation.setup import prepare
 from isac_rt.storage import KEPT, pack
@@ -94,7 +94,7 @@ def place(tmp_path, monkeypatch):
 def test_what_is_kept_is_what_would_be_prepared(place, monkeypatch):
     """Each change of a scenario, after the unchanged one was kept: the bytes are those of a set-up
     without a store. Planted bugs: a key without the seed, the materials, the poses or the noise;
-    sight kept by its knots alone, without its points."""
+    sight kept by its time samples alone, without its points."""
     monkeypatch.setenv(KEPT, str(place / "kept"))
     first = prepared(place, {})
     found = {name: prepared(place, change) for name, change in CHANGES.items()}
@@ -110,7 +110,11 @@ def test_a_second_set_up_makes_nothing_and_sees_every_byte_of_the_city(place, mo
     is made anew. Planted bug: the file's name and size in the key instead of its bytes."""
     first = prepared(place, {})
     calls = []
-    for room, name in ((clutter_field, "cut"), (clutter_field, "covered"), (sight, "crossings")):
+    for room, name in (
+        (clutter_field, "cut"),
+        (clutter_field, "merged_below_noise"),
+        (sight, "crossings"),
+    ):
         old = getattr(room, name)
         monkeypatch.setattr(
             room, name, lambda *a, old=old, name=name: calls.append(name) or old(*a)
@@ -123,7 +127,7 @@ def test_a_second_set_up_makes_nothing_and_sees_every_byte_of_the_city(place, mo
     digit = next(i for i in range(at, len(text)) if text[i].isdigit() and text[i] not in "09")
     file.write_text(text[:digit] + str(int(text[digit]) + 1) + text[digit + 1 :])
     assert prepared(place, {}) != first
-    assert {*calls} == {"cut", "covered", "crossings"}
+    assert {*calls} == {"cut", "merged_below_noise", "crossings"}
 
 
 def test_a_bent_file_is_made_again(place):

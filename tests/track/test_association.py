@@ -178,7 +178,7 @@ def test_the_association_is_the_likeliest_of_all(bistatic):
     determinant left out, halved or negative; the deviations of another detection; the sender's
     covariance left out; tentative tracks first; the velocity's difference unfolded; updates with
     another detection's deviations."""
-    rng, told, mattered = np.random.default_rng(12 + bistatic), 0, 0
+    rng, reports, mattered = np.random.default_rng(12 + bistatic), 0, 0
     for _ in range(40):
         cloud = np.linalg.cholesky(np.diag([9, 9, 9, 4, 4, 4.0]) + 0.5)
         states = FAR + rng.normal(size=(3, 6)) @ cloud.T
@@ -207,7 +207,7 @@ def test_the_association_is_the_likeliest_of_all(bistatic):
         expected, apart = in_turn(cost, confirmed)
         if min(apart, edge) < 0.1:
             continue
-        told += 1
+        reports += 1
         mattered += in_turn(without, confirmed)[0] != expected
         tracker, before = (
             Tracker(Tracking(gate_probability=GATE), Ambiguity(PERIOD)),
@@ -224,7 +224,7 @@ def test_the_association_is_the_likeliest_of_all(bistatic):
             assert np.diag(tracks[k].state.covariance) / scale**2 == pytest.approx(
                 np.ones(9), abs=0.05
             )
-    assert told >= 25
+    assert reports >= 25
     assert mattered >= 4
 
 

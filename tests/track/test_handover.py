@@ -96,13 +96,13 @@ def passive(answers=(), state: Gaussian | None = None, **settings) -> tuple[Pass
     """A passive terminal with a told receiver and, if there is a state, a reference of this state
     at time 0."""
     pt = passive_terminal(W, STEERED, Receivers(), Tracking(**settings), 8, AMPLITUDE)
-    told = Told(list(answers))
-    vars(pt)["receive"] = told  # in place of the method
+    reports = Told(list(answers))
+    vars(pt)["receive"] = reports  # in place of the method
     if state is not None:
         track = Track(pt.tracker.new_id(), state, 80.0, confirmed=True)
         pt.reference.state = Followed(track, -1e-6, TerminalState.TRACKING)
         pt.tracker.state.time = -1e-6
-    return pt, told
+    return pt, reports
 
 
 def known(position: float = 0.02, velocity: float = 0.1) -> Gaussian:
@@ -121,14 +121,14 @@ def test_a_prediction_is_what_its_samples_measure():
         @ np.linalg.qr(rng.normal(size=(9, 9)))[0]
     )
     states = [Gaussian(SENDER, root @ root.T), Gaussian(BODY, 2.3 * root @ root.T)]
-    pt, told = passive([heard()], states[0])
+    pt, reports = passive([heard()], states[0])
     pt.tracker.state.tracks = [
         Track(5, states[1], 20.0, confirmed=True),
         Track(6, Gaussian(BODY + 3, root @ root.T), 30.0, confirmed=False),
         Track(7, Gaussian(BODY - 3, root @ root.T), 30.0, confirmed=True, missed=1),
     ]
     pt.step(EMPTY, OWN, later, True)
-    ((prediction, modulated, _maps),) = told.handed
+    ((prediction, modulated, _maps),) = reports.handed
     flown = []
     for g in states:
         x = g.mean + rng.normal(size=(count, 9)) @ np.linalg.cholesky(g.covariance).T
@@ -151,10 +151,10 @@ def test_a_prediction_is_what_its_samples_measure():
 
 def test_the_strongest_of_all_weighs_one():
     """A reflector above the line of sight. Planted bug: weights over the reference's."""
-    pt, told = passive([heard()], known())
+    pt, reports = passive([heard()], known())
     pt.tracker.state.tracks = [Track(5, Gaussian(BODY, known().covariance), 320.0, confirmed=True)]
     pt.step(EMPTY, OWN, 0.01, True)
-    assert told.handed[0][0].weight == pytest.approx([0.25, 1.0])
+    assert reports.handed[0][0].weight == pytest.approx([0.25, 1.0])
 
 
 def test_what_is_reported_has_the_deviations_of_its_state():
@@ -189,10 +189,10 @@ def test_a_range_that_is_no_longer_known_reads_nothing(cells, told_range):
     P = np.zeros((9, 9))
     P[:3, :3] = (cells * CELL) ** 2 * np.outer(e, e) + 0.01**2 * np.eye(3)
     P[3:, 3:] = np.diag([0.001] * 3 + [0.5] * 3) ** 2
-    pt, told = passive([heard(), heard(), heard()], Gaussian(SENDER.copy(), P))
+    pt, reports = passive([heard(), heard(), heard()], Gaussian(SENDER.copy(), P))
     pt.step(EMPTY, OWN, 1e-4, True)
     pt.step(EMPTY, OWN, 2e-4, False)
-    (first, *_), (second, modulated, _) = told.handed
+    (first, *_), (second, modulated, _) = reports.handed
     assert (first is not None) is told_range
     assert second is None and not modulated
 
@@ -307,15 +307,15 @@ def test_patience_has_an_end():
     """25 frames of disbelief, and the next frame without data is believed; not the one before, and
     one that was believed begins the count anew. Planted bugs: no end; one too few."""
     for believed_first, frames, anew in ((False, 25, False), (False, 26, True), (True, 26, False)):
-        pt, told = passive([], known(0.001, 0.001))
+        pt, reports = passive([], known(0.001, 0.001))
         assert pt.reference.track is not None
         # a track at rest about the line of sight, so that time changes nothing
         pt.reference.track.state.mean[3:] = 0
         pt.reference.track.state.covariance[3:] = pt.reference.track.state.covariance[:, 3:] = 0
         z = sight() * [1, 0, 1, 1]
-        told.answers = [heard(z + np.array([0.5 * CELL, 0, 0, 0]))] * (frames + 1)
+        reports.answers = [heard(z + np.array([0.5 * CELL, 0, 0, 0]))] * (frames + 1)
         if believed_first:
-            told.answers[12] = heard(z)
+            reports.answers[12] = heard(z)
         for k in range(frames):
             pt.step(EMPTY, OWN, 1e-6 * k, True)
         assert pt.reference.track.missed == (frames if not believed_first else frames - 13)
@@ -367,9 +367,9 @@ def test_a_slip_is_repaired_and_the_frame_read_again():
         (read([], sight() - np.array([2 * CELL, 0, 0, 0])), False),
         (heard(), True),
     ):
-        pt, told = passive([read([-2, -2], sight()), again], known())
+        pt, reports = passive([read([-2, -2], sight()), again], known())
         reception, _ = pt.step(EMPTY, OWN, 0.0, True)
-        (first, *_), (second, modulated, _) = told.handed
+        (first, *_), (second, modulated, _) = reports.handed
         assert modulated and second.range[0] - first.range[0] == pytest.approx(-2 * CELL, abs=1e-9)
         assert second.velocity[0] == pytest.approx(first.velocity[0], abs=1e-9)
         assert second.direction[0] == pytest.approx(first.direction[0], abs=1e-12)
@@ -384,9 +384,9 @@ def test_a_slip_is_repaired_and_the_frame_read_again():
         ([-2, -2, 126], 100.0),
         ([127, 0], 100.0),
     ):
-        pt, told = passive([read(symbols, sight(), sure)], known())
+        pt, reports = passive([read(symbols, sight(), sure)], known())
         pt.step(EMPTY, OWN, 0.0, True)
-        assert len(told.handed) == 1
+        assert len(reports.handed) == 1
 
 
 def test_evidence_of_a_slip_is_gathered_over_twelve_frames():
@@ -394,17 +394,17 @@ def test_evidence_of_a_slip_is_gathered_over_twelve_frames():
     remembered for 12. A move from outside forgets it. Planted bugs: evidence for ever; kept over a
     correction."""
     for gap, told_once in ((11, False), (12, True)):
-        pt, told = passive([], known(1e-4, 1e-4))
+        pt, reports = passive([], known(1e-4, 1e-4))
         pt.reference.track.state.mean[3:] = 0
         z = sight() * [1, 0, 1, 1]
         symbols = [[-1], *[[]] * (gap - 1), [-1]]
-        told.answers = [read(s, z) for s in symbols] + [read([], z - np.array([CELL, 0, 0, 0]))]
+        reports.answers = [read(s, z) for s in symbols] + [read([], z - np.array([CELL, 0, 0, 0]))]
         for k in range(gap + 1):
             pt.step(EMPTY, OWN, 1e-6 * k, True)
         assert pt.reference.state.slips_repaired == (0 if told_once else 1)
-    pt, told = passive([], known(1e-4, 1e-4))
+    pt, reports = passive([], known(1e-4, 1e-4))
     pt.reference.track.state.mean[3:] = 0
-    told.answers = [read([-1], z), read([-1], z - np.array([CELL, 0, 0, 0]))]
+    reports.answers = [read([-1], z), read([-1], z - np.array([CELL, 0, 0, 0]))]
     pt.step(EMPTY, OWN, 0.0, True)
     pt.shorten(1, OWN)
     length = np.linalg.norm(pt.reference.track.state.mean[:3] - OWN.position)
@@ -435,16 +435,16 @@ def test_an_active_terminal_hands_its_clutter_on_and_folds_its_echoes():
     at = active_terminal(W, ANTENNAS, Receivers(), Tracking())
     z = np.asarray(what_is_measured(BODY, OWN), float)
     fold = np.array([-MIDDLE / W.slope, 1, 0, 0]) * period  # the same beat
-    told = Told([heard(None, [z + whole * fold]) for whole in (0, -1, 2)])
-    vars(at)["receive"] = told  # in place of the method
+    reports = Told([heard(None, [z + whole * fold]) for whole in (0, -1, 2)])
+    vars(at)["receive"] = reports  # in place of the method
     state = Gaussian(BODY.copy(), known(0.02, 0.2).covariance)
     at.tracker.state.tracks = [Track(at.tracker.new_id(), state, 20.0)]
     at.tracker.state.time = -1e-6
     payload: Any = object()
     for k in range(3):
         _, tracks = at.step(EMPTY, payload, OWN, 1e-6 * k, clutter=clutter, maps=k == 1)
-    assert [h[1] is clutter and h[0] is payload for h in told.handed] == [True] * 3
-    assert [h[2] for h in told.handed] == [False, True, False]
+    assert [h[1] is clutter and h[0] is payload for h in reports.handed] == [True] * 3
+    assert [h[2] for h in reports.handed] == [False, True, False]
     assert len(tracks) == 1 and tracks.age[0] == 3 and tracks.confirmed[0]
     pt, _ = passive()
     assert pt.tracker.ambiguity.period == pytest.approx(2 * period)
@@ -467,17 +467,17 @@ def test_mistakes_that_a_frame_shows_are_corrected_in_the_next():
     )
     first = Correction(0.2 * np.log(10), np.array([0.3, 0.0, 0.0]))
     second = Correction(-0.05 * np.log(10), np.array([0.0, 0.2, 0.0]))
-    told = Told([heard(correction=c) for c in (first, None, second, None)])
+    reports = Told([heard(correction=c) for c in (first, None, second, None)])
     at: Any = active_terminal(W, ANTENNAS, Receivers(), Tracking())
     for k in range(4):
         if k == 3:
             kept, at = at.memory(), active_terminal(W, ANTENNAS, Receivers(), Tracking())
             at.restore(kept)
-        vars(at)["receive"] = told  # in place of the method
+        vars(at)["receive"] = reports  # in place of the method
         at.step(EMPTY, None, OWN, 1e-6 * k, clutter=clutter)
     c = 299_792_458.0
     for k, (decibels, x, y) in enumerate([(0, 0, 0), (2, 0.3, 0), (2, 0.3, 0), (1.5, 0.3, 0.2)]):
-        handed = told.handed[k][1]
+        handed = reports.handed[k][1]
         assert handed.power == pytest.approx(10 ** (decibels / 10) * clutter.power, abs=0)
         more = -np.array([2 * y, 0.6 * x + 1.8 * y]) / c
         assert handed.delay_rate - clutter.delay_rate == pytest.approx(more, abs=1e-20)

@@ -23,7 +23,7 @@ from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
 from isac_rt.track.filter import Gaussian
-from isac_rt.track.parts import KnownBody, Own, of_itself
+from isac_rt.track.parts import Own, ReportedUav, of_itself
 from isac_rt.track.reference import TerminalState
 from isac_rt.track.settings import Tracking
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
@@ -216,9 +216,9 @@ def test_the_active_terminal_expects_its_tracks_and_its_mates_where_they_are():
     at.tracker.state.tracks = [Track(0, body, 10.0), Track(1, still, 10.0)]
     at.tracker.state.time = 0.0
     at.tracker.predict(0.5)
-    told = [KnownBody("PT", of_itself(mate)), KnownBody("", of_itself(own))]
+    reports = [ReportedUav("PT", of_itself(mate)), ReportedUav("", of_itself(own))]
     assert at.equipment.expect_targets is expected_targets
-    sought = expected_targets(at.tracker, Own(own, 0.5, reports=told))
+    sought = expected_targets(at.tracker, Own(own, 0.5, reports=reports))
     np.testing.assert_allclose(sought.mean, [[28, -4, 0, 0], [20, 3, 0, 0]], atol=1e-9)
     np.testing.assert_allclose(sought.std[1, :2], 0.05 * np.sqrt(2))
     plain = active_terminal(W, ANTENNAS, Receivers(clutter_detector="angle_doppler"), Tracking())

@@ -16,8 +16,8 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.rcs import CrossSection, large_uav_db
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.propagation.settings import Clutter
-from isac_rt.propagation.ways import LinkState
 from isac_rt.simulation.setup import propagation_in
 from isac_rt.world.city import CityMesh
 from isac_rt.world.city.materials import Material, resolve_materials, water_permittivity

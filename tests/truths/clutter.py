@@ -13,7 +13,7 @@ import trimesh
 from scipy import ndimage, stats
 
 from isac_rt.frame.link import Link
-from isac_rt.propagation.ways import LinkState
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import prepare, propagation_in, swarm_of
 from isac_rt.world.city import CityMesh, load_city

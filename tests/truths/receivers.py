@@ -19,7 +19,7 @@ from isac_rt.propagation.settings import Clutter
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.arms import arm
 from isac_rt.receive.cfar import CfarRule, greatest_of_factor
-from isac_rt.receive.clutter_filter import remove_standing
+from isac_rt.receive.clutter_filter import remove_static
 from isac_rt.receive.estimate import direction_cosine
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps, slow_window, union_operator
@@ -433,7 +433,7 @@ def standing_clutter_is_removed() -> float:
     ]  # whole turns over an antenna's chirps: no mean
     chosen = np.take_along_axis(still, np.broadcast_to(schedule[:, None], (3, 3, 60)), axis=2)
     spectra = np.repeat((100 * chosen)[:, :, None] + moving, 4, axis=2).astype(np.complex64)
-    remove_standing(spectra, schedule, None)
+    remove_static(spectra, schedule, None)
     return float(np.abs(spectra - moving).max() / 100)
 
 

@@ -142,8 +142,8 @@ def consistency_of_innovations() -> float:
 
 FLIGHTS = 20
 WIND_STD, WIND_TIME = np.array([3.7, 3.7, 2.3]), np.array([20.0, 20.0, 5.0])
-"""Dryden's turbulence of MIL-F-8785C at 50 m in a severe wind of 45 knots, met at 10 m/s: standard
-deviations [m/s] and correlation times [s]."""
+"""Dryden's turbulence of MIL-F-8785C at 50 m in a severe wind of 45 time samples, met at 10 m/s:
+standard deviations [m/s] and correlation times [s]."""
 
 
 def _acceleration(manoeuvre: str, velocity: np.ndarray, wind: np.ndarray) -> np.ndarray:

@@ -89,11 +89,11 @@ def test_courtyard_building_is_closed_with_the_right_volume_and_areas(tmp_path):
     of = {name: city.face_material == names.index(name) for name in names}
     plan = 30.0 * 24.5 - 17.8 * 10.5
     perimeter = 2 * (30.0 + 24.5) + 2 * (17.8 + 10.5)
-    sheet = (30.0 + 2 * margin) * (24.5 + 2 * margin)
+    buffer = (30.0 + 2 * margin) * (24.5 + 2 * margin)
     relative = 1e-12  # a dozen sums of float64
     assert city.areas[of["brick"]].sum() == pytest.approx(perimeter * height, rel=relative)
     assert city.areas[of["wood"]].sum() == pytest.approx(plan, rel=relative)
-    assert city.areas[of["asphalt"]].sum() == pytest.approx(plan + sheet, rel=relative)
+    assert city.areas[of["asphalt"]].sum() == pytest.approx(plan + buffer, rel=relative)
     closed = np.ones(city.num_faces, dtype=bool)
     closed[-2:] = False  # the ground comes last
     prism = solid(city, closed)
@@ -152,14 +152,14 @@ def test_every_building_of_the_sample_quarter_is_closed():
         F_C,
         ORIGIN,
     )
-    bodies = trimesh.Trimesh(city.vertices, city.faces[:-2], process=False).split(
+    solids = trimesh.Trimesh(city.vertices, city.faces[:-2], process=False).split(
         only_watertight=True
     )
-    assert len(bodies) == 13
-    tallest = max(body.bounds[1, 2] for body in bodies)
+    assert len(solids) == 13
+    tallest = max(body.bounds[1, 2] for body in solids)
     assert tallest == 41.0
     assert any("without 'height'" in note for note in city.notes)
-    assert sum(body.volume for body in bodies) > 0
+    assert sum(body.volume for body in solids) > 0
 
 
 def test_self_crossing_outline_is_repaired_and_a_line_refused(tmp_path):

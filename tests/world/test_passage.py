@@ -133,11 +133,11 @@ def test_terraces_and_halls():
         ]
     )
     hall = city_of(yard)
-    sheet = np.array([[-10.0, -10, 12.1], [10, -10, 12.1], [-10, 10, 12.1], [10, 10, 12.1]])
+    buffer = np.array([[-10.0, -10, 12.1], [10, -10, 12.1], [-10, 10, 12.1], [10, 10, 12.1]])
     roof = np.array(SIDES["bottom"], np.int32) + len(hall.vertices)
     hall = replace(
         hall,
-        vertices=np.concatenate([hall.vertices, sheet]),
+        vertices=np.concatenate([hall.vertices, buffer]),
         faces=np.concatenate([hall.faces, roof]),
     )
     assert not enclosed(hall, np.array([1.3, -2.1, 4.4]))

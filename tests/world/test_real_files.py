@@ -42,15 +42,15 @@ def test_a_city_fills_the_box_of_its_vertices(name, crs, says):
 
 
 @pytest.mark.parametrize("name", ["delft", "zurich"])
-@pytest.mark.parametrize("bend", ["cut", "no vertices", "beyond the vertices"])
-def test_bent_copies_are_one_message(name, bend, tmp_path):
+@pytest.mark.parametrize("curvature", ["cut", "no vertices", "beyond the vertices"])
+def test_bent_copies_are_one_message(name, curvature, tmp_path):
     text = (DATA / f"{name}.city.json").read_text()
     held = json.loads(text)
-    if bend == "no vertices":
+    if curvature == "no vertices":
         del held["vertices"]
-    if bend == "beyond the vertices":
+    if curvature == "beyond the vertices":
         held["vertices"] = held["vertices"][:9]
-    bent = text[: len(text) // 2] if bend == "cut" else json.dumps(held)
+    bent = text[: len(text) // 2] if curvature == "cut" else json.dumps(held)
     (tmp_path / "bent.city.json").write_text(bent)
     with pytest.raises(CityError, match=r"bent\.city\.json"):
         read(tmp_path, "bent.city.json")

@@ -85,7 +85,8 @@ def test_what_looks_nowhere_looks_north_and_straight_up_has_east_to_its_right():
 
 def natural_spline(times, values, t):
     """The cubic through the values with no curvature at its ends, by solving for the second
-    derivatives at the knots in the textbook's form: (3, 3) place, velocity and acceleration."""
+    derivatives at the time samples in the textbook's form: (3, 3) place, velocity and
+    acceleration."""
     n, h = len(times), np.diff(times)
     A, b = np.eye(n), np.zeros((n, 3))
     for i in range(1, n - 1):

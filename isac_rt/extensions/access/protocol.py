@@ -2,22 +2,21 @@
 links acknowledged.
 
 Active terminals join one after the other; those that have joined send data all the while, so that
-the next ones hear them (or collide with them, if they cannot). One terminal's stages, each frame
+the next ones receive them (or collide with them, if they cannot). One terminal's stages, each frame
 right after the last:
 
-1. It listens to M blocks per frame until it has heard all of them, takes the free run nearest to
+1. It listens to M blocks per frame until it has received all of them, takes the free run nearest to
 its wish, and announces its first block
    by on-off keying in all M blocks while the passive terminals scan the blocks as it did.
 2. Round 1: it sends an unmodulated frame to all. Round 2: its passive terminals answer unmodulated,
 up to M in one frame, each in one
    block of the run. With an external clock this stage is left out.
-3. Those that understood the announcement and heard round 1 acknowledge by on-off keying in their
+3. Those that understood the announcement and received round 1 acknowledge by on-off keying in their
 block.
 
 Whoever sends here sends `hold` later than its clock says, so that a clock that is ahead by more
-than the path's delay is heard all the same; receivers know it. Not modelled: the passage of round
-1's estimate from one end to the other, taken as free of errors.
-"""
+than the path's delay is received all the same; receivers know it. Not modelled: the passage of
+round 1's estimate from one end to the other, taken as free of errors."""
 
 from __future__ import annotations
 
@@ -131,7 +130,7 @@ class LinkState:
 
     Attributes
     ----------
-    heard_block : first block on the passive terminal's own grid, None when no announcement was
+    received_block : first block on the passive terminal's own grid, None when no announcement was
         understood
     message : what it understood
     identified : whether that is what was announced
@@ -139,7 +138,7 @@ class LinkState:
     sent_acknowledgment, acknowledged : by the passive terminal; as the active one read it
     """
 
-    heard_block: int | None
+    received_block: int | None
     message: Message | None
     identified: bool
     clock: ClockEstimate | None
@@ -155,7 +154,7 @@ class Establishment:
     ----------
     blocks : first block of each active terminal, None where no run was free
     links : state of every (active, passive) link
-    missed_blocks, false_blocks : taken blocks that each active terminal did not hear, free ones
+    missed_blocks, false_blocks : taken blocks that each active terminal did not receive, free ones
         that it thought taken
     missed_announcements, wrong_announcements : links whose passive terminal understood nothing, or
         something else
@@ -176,7 +175,7 @@ class Establishment:
 
 
 class _Air:
-    """The frames as they go by: who has joined, what everybody hears."""
+    """The frames as they go by: who has joined, what everybody receives."""
 
     def __init__(self, network: Network) -> None:
         self.n = network
@@ -208,7 +207,7 @@ class _Air:
             active=active,
         )
 
-    def hear(self, name: str, first_block: int, sent: Sequence[Transmission] = ()) -> IFCube:
+    def received(self, name: str, first_block: int, sent: Sequence[Transmission] = ()) -> IFCube:
         """Samples of a terminal with its references in M blocks from `first_block` of its own grid,
         those that have joined included."""
         n, w = self.n, self.n.waveform
@@ -247,7 +246,7 @@ def establish(network: Network) -> Establishment:
     Returns
     -------
     Establishment; wrong decisions are among its counts and have their consequences: a terminal that
-    misses the announcement hears no round, one whose clock is unknown is not acknowledged.
+    misses the announcement receives no round, one whose clock is unknown is not acknowledged.
     """
     air = _Air(network)
     links: dict[Link, LinkState] = {}
@@ -282,7 +281,7 @@ def establish(network: Network) -> Establishment:
 
 
 def scan(num_blocks: int, width: int) -> list[int]:
-    """First blocks of the stretches of `width` blocks in which all blocks are heard; the last
+    """First blocks of the stretches of `width` blocks in which all blocks are received; the last
     stretch may overlap."""
     return [min(first, num_blocks - width) for first in range(0, num_blocks, width)]
 
@@ -297,11 +296,11 @@ def _occupied(air: _Air) -> np.ndarray:
 
 
 def _listen(air: _Air, at: str) -> np.ndarray:
-    """Blocks that an active terminal hears somebody in, (blocks,) bool."""
+    """Blocks that an active terminal receives somebody in, (blocks,) bool."""
     w = air.n.waveform
     taken = np.zeros(w.num_resource_blocks, bool)
     for first in scan(taken.size, w.num_groups):
-        hot = hot_chirps(air.hear(at, first).samples)
+        hot = hot_chirps(air.received(at, first).samples)
         taken[first : first + w.num_groups] |= hot >= needed_chirps(w.num_chirps, BLOCK_FALSE_RATE)
         air.frame += 1
     return taken
@@ -312,10 +311,10 @@ def _join(air: _Air, at: str, block: int) -> dict[Link, LinkState]:
     n = air.n
     pts = list(n.listeners[at])
     said = Message(n.names.index(at), block)
-    heard = _announce(air, said, pts)
+    answers = _announce(air, said, pts)
     first: dict[str, Round | None] = {}
     second: dict[str, Round | None] = {}
-    understood = {pt: got[0] for pt, got in heard.items() if got is not None}
+    understood = {pt: got[0] for pt, got in answers.items() if got is not None}
     if not n.external_clock:
         first = _first_round(air, at, block, understood)
         understood = {pt: b for pt, b in understood.items() if first[pt] is not None}
@@ -323,12 +322,12 @@ def _join(air: _Air, at: str, block: int) -> dict[Link, LinkState]:
     read_back = _acknowledge(air, at, block, pts, understood)
     out = {}
     for pt in pts:
-        got = heard[pt]
+        got = answers[pt]
         message = None if got is None else got[1]
         both = [r for r in (first.get(pt), second.get(pt)) if r is not None]
         clock = EXTERNAL if n.external_clock else estimate_clock(both) if len(both) == 2 else None
         out[Link(at, pt)] = LinkState(
-            heard_block=None if got is None else got[0],
+            received_block=None if got is None else got[0],
             message=message,
             identified=message == said,
             clock=clock,
@@ -350,7 +349,7 @@ def _announce(
     for first in scan(w.num_resource_blocks, w.num_groups):
         sent = air.sender(n.names[said.sender], said.block, active=mask)
         for pt in pts:
-            samples = air.hear(pt, first, [sent]).samples
+            samples = air.received(pt, first, [sent]).samples
             for m in range(w.num_groups):
                 if first + m in known[pt]:
                     continue
@@ -360,10 +359,10 @@ def _announce(
                 if message is not None:
                     votes[pt].append((first + m, message))
         air.frame += 1
-    return {pt: _first_heard(v, w.num_groups) for pt, v in votes.items()}
+    return {pt: _first_received(v, w.num_groups) for pt, v in votes.items()}
 
 
-def _first_heard(votes: Sequence[tuple[int, Message]], width: int) -> tuple[int, Message] | None:
+def _first_received(votes: Sequence[tuple[int, Message]], width: int) -> tuple[int, Message] | None:
     """The message that most blocks carry, in at least half of a run, and the first of these blocks:
     another's data may look like one."""
     agreed = consensus([message for _, message in votes])
@@ -371,7 +370,7 @@ def _first_heard(votes: Sequence[tuple[int, Message]], width: int) -> tuple[int,
     return None if agreed is None or 2 * len(blocks) < width else (min(blocks), agreed)
 
 
-def _sight(air: _Air, cube: IFCube) -> Detections:
+def _line_of_sight(air: _Air, cube: IFCube) -> Detections:
     return receive_passive(
         cube, air.n.antennas, air.n.receivers, air.n.dpsk_order, None, False
     ).detections
@@ -383,7 +382,7 @@ def _first_round(
     """The active terminal's unmodulated frame at every passive one that knows where to listen."""
     sent, w, out = air.sender(at, block), air.n.waveform, {}
     for pt, first in understood.items():
-        found = _sight(air, air.hear(pt, first, [sent]))
+        found = _line_of_sight(air, air.received(pt, first, [sent]))
         whole = (first - block) * w.group_spacing  # blocks by which the two grids differ
         held = air.n.hold - whole
         out[pt] = round_of(found, air.time, True, cell=w.range_cell(1), held=held)
@@ -419,10 +418,10 @@ def _second_round(
     """The passive terminals' unmodulated answers at the active one."""
     w, out = air.n.waveform, {}
     for turn in _turns(pts, w.num_groups):
-        cube = air.hear(at, block, _answers(air, turn, understood, {}))
+        cube = air.received(at, block, _answers(air, turn, understood, {}))
         for group, pt in turn:
             if pt in understood:
-                found = _sight(air, cube.of_groups([group]))
+                found = _line_of_sight(air, cube.of_groups([group]))
                 # it answers on its own grid, whole blocks late by the other one's, as both know
                 held = air.n.hold + (understood[pt] - block) * w.group_spacing
                 out[pt] = round_of(found, air.time, False, cell=w.range_cell(1), held=held)
@@ -438,7 +437,7 @@ def _acknowledge(
     words = {pt: n.codebook.encode(Message(n.names.index(pt), block)) for pt in pts}
     out = set()
     for turn in _turns(pts, n.waveform.num_groups):
-        cube = air.hear(at, block, _answers(air, turn, understood, words))
+        cube = air.received(at, block, _answers(air, turn, understood, words))
         for group, pt in turn:
             got = read(cube.samples[group : group + 1], n.codebook.num_bits)
             if got.found and n.codebook.decode(got.bits) == Message(n.names.index(pt), block):

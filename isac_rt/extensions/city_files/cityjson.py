@@ -142,7 +142,7 @@ class _Any(Part):
 
 
 @dataclass(frozen=True)
-class Body:
+class Solid:
     """A thing with surfaces.
 
     Parameters
@@ -182,13 +182,13 @@ class CityModel:
         What the file says of its coordinate reference system.
     outlines : list of Outline
         Footprints to extrude.
-    bodies : list of Body
+    solids : list of Body
         All else; those of `BUILDING_TYPES` stand on the ground, TINRelief is ground.
     """
 
     crs: str = ""
     outlines: list[Outline] = field(default_factory=list)
-    bodies: list[Body] = field(default_factory=list)
+    solids: list[Solid] = field(default_factory=list)
 
 
 def _flat(boundaries: list, values: Any, depth: int) -> Iterator[tuple[list, int | None]]:
@@ -382,12 +382,12 @@ class _Reader:
         what, kind = f"{self.name}: object {key}", str(item.type)
         if _has_faces(geometry) or kind in _FLAT_TYPES:
             root = _root(key, objects)
-            body = self._body(what, kind, root, geometry, vertices)
-            if not len(body.vertices):
+            solid = self._solid(what, kind, root, geometry, vertices)
+            if not len(solid.vertices):
                 raise CityError(f"{what}: has no surface; correct or remove it")
-            self.model.bodies.append(body)
+            self.model.solids.append(solid)
             if kind not in BUILDING_TYPES:
-                self.counted[kind, next(iter(body.faces))] += 1
+                self.counted[kind, next(iter(solid.faces))] += 1
         elif not detailed.intersection(item.children) and not isinstance(geometry, _Instance):
             try:
                 height = _height(item.attributes or {}, self.city.height_property)
@@ -397,14 +397,14 @@ class _Reader:
             if plan is not None:
                 self.model.outlines.append(Outline(plan[0], what, height or None, foot=plan[1]))
 
-    def _body(
+    def _solid(
         self,
         what: str,
         kind: str,
         root: str,
         geometry: _Surfaced | _Instance,
         vertices: NDArray[np.float64],
-    ) -> Body:
+    ) -> Solid:
         if isinstance(geometry, _Instance):
             geometry, vertices = self._instance(geometry, vertices, what)
         faces, ground = _faces(geometry, vertices, self.city, kind, what)
@@ -415,7 +415,7 @@ class _Reader:
         foot = np.searchsorted(used, ground[np.isin(ground, used)])
         if not foot.size and len(own):
             foot = np.flatnonzero(own[:, 2] <= own[:, 2].min() + FOOT_M)
-        return Body(what, kind, root, own, dict(zip(faces, parts, strict=True)), foot)
+        return Solid(what, kind, root, own, dict(zip(faces, parts, strict=True)), foot)
 
     def _instance(
         self, instance: _Instance, vertices: NDArray[np.float64], what: str

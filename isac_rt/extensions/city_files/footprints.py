@@ -68,8 +68,8 @@ _REMEDY_XML = (
 def _boxes(model: CityModel) -> NDArray[np.float64]:
     """West, south, east, north of all that a file holds."""
     boxes = [shapely.bounds(outline.shape) for outline in model.outlines]
-    for body in model.bodies:
-        plan = body.vertices[:, :2]
+    for solid in model.solids:
+        plan = solid.vertices[:, :2]
         boxes.append(np.concatenate([plan.min(axis=0), plan.max(axis=0)]))
     return np.array(boxes).reshape(-1, 4)
 
@@ -95,7 +95,7 @@ def _without_strays(model: CityModel, bad: list[str]) -> CityModel:
             bad.append(f"{outline.what}: lies far from all others; correct or remove it")
         else:
             kept.append(outline)
-    return CityModel(model.crs, kept, model.bodies)
+    return CityModel(model.crs, kept, model.solids)
 
 
 def _place(city: settings.City, model: CityModel, name: str, notes: list[str]) -> Place:
@@ -125,15 +125,15 @@ def _moved(model: CityModel, place: Place) -> CityModel:
         )
         for outline in model.outlines
     ]
-    if not model.bodies:
+    if not model.solids:
         return CityModel(model.crs, outlines)
-    vertices = place.to_world(np.concatenate([body.vertices for body in model.bodies]))
-    ends = np.cumsum([len(body.vertices) for body in model.bodies])[:-1]
-    bodies = [
-        replace(body, vertices=own)
-        for body, own in zip(model.bodies, np.split(vertices, ends), strict=True)
+    vertices = place.to_world(np.concatenate([solid.vertices for solid in model.solids]))
+    ends = np.cumsum([len(solid.vertices) for solid in model.solids])[:-1]
+    solids = [
+        replace(solid, vertices=own)
+        for solid, own in zip(model.solids, np.split(vertices, ends), strict=True)
     ]
-    return CityModel(model.crs, outlines, bodies)
+    return CityModel(model.crs, outlines, solids)
 
 
 def _ground(
@@ -147,18 +147,18 @@ def _ground(
         city.ground_margin_m,
         MaterialUse(city.ground_material),
     )
-    relief = [body for body in model.bodies if body.kind == "TINRelief"]
+    relief = [solid for solid in model.solids if solid.kind == "TINRelief"]
     if terrain is not None:
         return of_raster(plan, terrain, place, notes)
     if relief:
         return of_relief(relief)
-    _, feet = feet_of(model.bodies)
+    _, feet = feet_of(model.solids)
     stand = [(*shapely.get_coordinates(o.shape.centroid)[0], o.foot) for o in _standing(model)]
     feet = np.concatenate([feet, np.array(stand, dtype=np.float64).reshape(-1, 3)])
     if len(feet):
         return ground_through(plan, feet, notes)
-    lowest = min((float(body.vertices[:, 2].min()) for body in model.bodies), default=0.0)
-    return flat(plan, lowest if model.bodies else -place.origin[2])
+    lowest = min((float(solid.vertices[:, 2].min()) for solid in model.solids), default=0.0)
+    return flat(plan, lowest if model.solids else -place.origin[2])
 
 
 def _standing(model: CityModel) -> list[Outline]:
@@ -232,7 +232,7 @@ def located(
     CityError
     """
     model = _without_strays(_model(city, path, notes), bad)
-    if not model.outlines and not model.bodies:
+    if not model.outlines and not model.solids:
         raise CityError(
             bad[0] if bad else f"{path.name}: there is no polygon in it; give building footprints"
         )
@@ -267,18 +267,18 @@ def footprints(
     surfaces = _raised(city, model.outlines, base, bad, notes)
     if base.surface is not None:
         surfaces.append(base.surface)
-    return [*_bodies(model, base, terrain is not None, notes), *surfaces], notes, place
+    return [*_solids(model, base, terrain is not None, notes), *surfaces], notes, place
 
 
-def _bodies(model: CityModel, base: Ground, replaced: bool, notes: list[str]) -> list[Surface]:
+def _solids(model: CityModel, base: Ground, replaced: bool, notes: list[str]) -> list[Surface]:
     """Return the parts that have surfaces of their own, down to the ground."""
-    standing = feet_of(model.bodies)[0]
+    standing = feet_of(model.solids)[0]
     down = dict(zip(map(id, standing), lowered(standing, base), strict=True))
     surfaces, deep = list[Surface](), list[float]()
-    for body in model.bodies:
-        if replaced and body.kind == "TINRelief":
+    for solid in model.solids:
+        if replaced and solid.kind == "TINRelief":
             continue
-        grounded, by = down.get(id(body), (body, 0.0))
+        grounded, by = down.get(id(solid), (solid, 0.0))
         surfaces += grounded.surfaces()
         deep += [by] if by > SEEN_LOWERED_M else []
     if deep:

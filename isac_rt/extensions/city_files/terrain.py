@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isac_rt.extensions.city_files.cityjson import BUILDING_TYPES, Body
+from isac_rt.extensions.city_files.cityjson import BUILDING_TYPES, Solid
 from isac_rt.world.city.files import needs_extra, read_bytes
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface
@@ -107,11 +107,11 @@ def _upward(points: NDArray[np.float64], triangles: NDArray) -> NDArray[np.int64
     return out
 
 
-def of_relief(bodies: Sequence[Body]) -> Ground:
+def of_relief(solids: Sequence[Solid]) -> Ground:
     """The relief that the file brings."""
     from scipy.spatial import cKDTree
 
-    points = np.concatenate([body.vertices for body in bodies])
+    points = np.concatenate([solid.vertices for solid in solids])
     tree = cKDTree(points[:, :2])
 
     def height(at: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -230,13 +230,13 @@ def _window(
     return window, (int(shape[0]), int(shape[1])), places
 
 
-def feet_of(bodies: Sequence[Body]) -> tuple[list[Body], NDArray[np.float64]]:
+def feet_of(solids: Sequence[Solid]) -> tuple[list[Solid], NDArray[np.float64]]:
     """The bodies that stand on the ground and where: the middle of the feet of each (N, 3)."""
-    roots: dict[str, list[Body]] = {}
-    for body in bodies:
-        if body.kind in BUILDING_TYPES and body.foot.size:
-            roots.setdefault(body.root, []).append(body)
-    standing = [body for parts in roots.values() for body in parts if not _stands_on(body, parts)]
+    roots: dict[str, list[Solid]] = {}
+    for solid in solids:
+        if solid.kind in BUILDING_TYPES and solid.foot.size:
+            roots.setdefault(solid.root, []).append(solid)
+    standing = [solid for parts in roots.values() for solid in parts if not _rests_on(solid, parts)]
     points = [
         np.append(b.vertices[b.foot, :2].mean(axis=0), np.median(b.vertices[b.foot, 2]))
         for b in standing
@@ -244,14 +244,14 @@ def feet_of(bodies: Sequence[Body]) -> tuple[list[Body], NDArray[np.float64]]:
     return standing, np.array(points).reshape(-1, 3)
 
 
-def _stands_on(body: Body, parts: Sequence[Body]) -> bool:
+def _rests_on(solid: Solid, parts: Sequence[Solid]) -> bool:
     """Return whether a part of a building has another one under it."""
-    middle = body.vertices[body.foot, :2].mean(axis=0)
-    level = body.vertices[body.foot, 2].min()
+    middle = solid.vertices[solid.foot, :2].mean(axis=0)
+    level = solid.vertices[solid.foot, 2].min()
     for other in parts:
         plan = other.vertices[:, :2]
         if (
-            other is not body
+            other is not solid
             and other.vertices[other.foot, 2].min() < level - STANDS_ON_M
             and (plan.min(axis=0) <= middle).all()
             and (middle <= plan.max(axis=0)).all()
@@ -260,24 +260,24 @@ def _stands_on(body: Body, parts: Sequence[Body]) -> bool:
     return False
 
 
-def lowered(bodies: Sequence[Body], base: Ground) -> list[tuple[Body, float]]:
+def lowered(solids: Sequence[Solid], base: Ground) -> list[tuple[Solid, float]]:
     """Bodies whose feet reach down to the ground, and by how much the farthest of each went [m].
     The ground is asked once for all of them."""
-    if not bodies:
+    if not solids:
         return []
-    feet = [body.vertices[body.foot] for body in bodies]
+    feet = [solid.vertices[solid.foot] for solid in solids]
     ends = np.cumsum([len(foot) for foot in feet])[:-1]
     under = np.split(base.height(np.concatenate(feet)[:, :2]), ends)
     return [
-        _lowered(body, foot[:, 2] - float(below.min()))
-        for body, foot, below in zip(bodies, feet, under, strict=True)
+        _lowered(solid, foot[:, 2] - float(below.min()))
+        for solid, foot, below in zip(solids, feet, under, strict=True)
     ]
 
 
-def _lowered(body: Body, down: NDArray[np.float64]) -> tuple[Body, float]:
+def _lowered(solid: Solid, down: NDArray[np.float64]) -> tuple[Solid, float]:
     """A body whose feet went down by so much [m], where that is down."""
     if not (down > 0).any():
-        return body, 0.0
-    vertices = body.vertices.copy()
-    vertices[body.foot, 2] -= np.maximum(down, 0.0)
-    return replace(body, vertices=vertices), float(down.max())
+        return solid, 0.0
+    vertices = solid.vertices.copy()
+    vertices[solid.foot, 2] -= np.maximum(down, 0.0)
+    return replace(solid, vertices=vertices), float(down.max())

@@ -60,7 +60,7 @@ flies by adds less, in a canyon 0.1 to 0.2 of the UAV's echo."""
 
 
 @dataclass(frozen=True)
-class Judged:
+class Tested:
     """A detector's verdict on every cell, Doppler centred.
 
     Attributes
@@ -99,14 +99,14 @@ class AngleDoppler:
     fitted: bool = True
 
     def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
-        """Detections in cleaned spectra of echoes; raises as `judge`."""
+        """Detections in cleaned spectra of echoes; raises as `test_cells`."""
         (maps, power), correction = maps_with_power(spectra, known), None
         clutter = hints.clutter
         if clutter is not None and self.fitted:
             correction = correct(power, known, clutter)
             clutter = correction.apply(clutter)
         hints = replace(hints, clutter=clutter)
-        judged = replace(self, fitted=False).judge([maps], known, hints)[0]
+        judged = replace(self, fitted=False).test_cells([maps], known, hints)[0]
         ratio, first = judged.ratio.copy(), first_row(self.settings, known.range_cell)
         ratio[:first] = 0
         rows, bins = strongest_peaks(ratio, ratio > 1, self.settings, UNION_FLOOR)
@@ -126,7 +126,7 @@ class AngleDoppler:
         in_clutter = np.array([cell in judged.whiteners for cell in cells], bool)
         starts = (judged.sure[rows, bins] > 1) & (detections.starts | in_clutter)
         if first:
-            starts &= ~in_skirt(rows, bins, power, first)
+            starts &= ~in_sidelobe(rows, bins, power, first)
         directions = np.array(direction).reshape(-1, 2)
         detections = replace(detections, direction=directions, starts=starts)
         out = Sensed(found, detections, power, judged.level, correction=correction)
@@ -136,7 +136,7 @@ class AngleDoppler:
         noise = noise_level(power, expected, known.channels)
         return replace(out, neighbours=phases(maps, expected, noise, known, clutter))
 
-    def judge(self, frames: Sequence[np.ndarray], known: Known, hints: Hints) -> list[Judged]:
+    def test_cells(self, frames: Sequence[np.ndarray], known: Known, hints: Hints) -> list[Tested]:
         """The verdict on frames that share their data and what is expected of them.
 
         Parameters
@@ -154,7 +154,7 @@ class AngleDoppler:
         clutter, expected, noise = self.expectation(powers, known, hints.clutter)
         hints = replace(hints, clutter=clutter)
         return [
-            self._judge(maps, power, n, expected, known, hints)
+            self._test(maps, power, n, expected, known, hints)
             for maps, power, n in zip(frames, powers, noise, strict=True)
         ]
 
@@ -174,7 +174,7 @@ class AngleDoppler:
         noise = [noise_level(power, expected, known.channels) for power in powers]
         return clutter, expected, noise
 
-    def _judge(
+    def _test(
         self,
         maps: np.ndarray,
         power: np.ndarray,
@@ -182,7 +182,7 @@ class AngleDoppler:
         expected: np.ndarray,
         known: Known,
         hints: Hints,
-    ) -> Judged:
+    ) -> Tested:
         assert hints.clutter is not None  # `expectation` has it
         everything, arms = searches(known.antennas, known.wavenumber)
         limits = self._limits(everything, known), self._limits(arms, known)
@@ -200,23 +200,23 @@ class AngleDoppler:
         cell = plain.cell[filled[plain.cell] & (plain.peak > PRUNED * limits[1][0])]
         bucketed = Bucketed.of(hints.clutter, known, everything, noise, self.taper)
 
-        def heard(cell: np.ndarray, search: Search) -> np.ndarray:
+        def received(cell: np.ndarray, search: Search) -> np.ndarray:
             c = search.channels
             x = maps.reshape(*maps.shape[:2], -1)[c.tx[:, None], c.rx[:, None], cell]
             return np.ascontiguousarray(x.T)[:, None] / np.float32(np.sqrt(noise))
 
         R = bucketed.among(arms_of(known)).covariances(*np.divmod(cell, power.shape[1]))
-        found, _ = search_white(heard(cell, arms), R, cell, arms)
+        found, _ = search_white(received(cell, arms), R, cell, arms)
         note(found, limits[1])
         # the few that remain with all channels: fewer directions look alike
         cell = cell[found.peak > PRUNED * limits[1][0]]
         R = bucketed.covariances(*np.divmod(cell, power.shape[1]))
-        note(search_white(heard(cell, everything), R, cell, everything)[0], limits[0])
+        note(search_white(received(cell, everything), R, cell, everything)[0], limits[0])
         inverse = dict(zip(cell.tolist(), inverses(R), strict=True))
         for gate in _gates(hints.gates, known, len(power), ratio, cosines):
             quiet = not filled[gate.cell].any()
             whiten = None if quiet else bucketed.covariances(*np.divmod(gate.cell, power.shape[1]))
-            found = seek(gate, heard(gate.cell, everything), whiten, everything)
+            found = seek(gate, received(gate.cell, everything), whiten, everything)
             limit = gate.threshold(everything, self.settings.gate_rate)
             if found.peak[0] > limit:
                 ratio[found.cell], cosines[found.cell] = found.peak / limit, found.cosines
@@ -229,7 +229,7 @@ class AngleDoppler:
         half = bins // 2
         whiteners = {(c // bins, (c % bins + half) % bins): one for c, one in inverse.items()}
         passed = shown[0] / held_up, shown[1] / held_up
-        return Judged(*passed, noise + expected, shown[2], whiteners)
+        return Tested(*passed, noise + expected, shown[2], whiteners)
 
     def _limits(self, search: Search, known: Known) -> tuple[float, float]:
         """Thresholds of a detection and of one that may start a track."""
@@ -293,7 +293,7 @@ def correct(power: np.ndarray, known: Known, clutter: ExpectedClutter) -> Correc
     return fit(power, noise_level(power, expected, known.channels), clutter, known)
 
 
-def in_skirt(rows: np.ndarray, bins: np.ndarray, power: np.ndarray, first: int) -> np.ndarray:
+def in_sidelobe(rows: np.ndarray, bins: np.ndarray, power: np.ndarray, first: int) -> np.ndarray:
     """Mark the cells that hold no more than the sidelobes of the strongest path before the row
     `first`: the transmitter's leakage."""
     row, column = np.unravel_index(power[:first].argmax(), power[:first].shape)

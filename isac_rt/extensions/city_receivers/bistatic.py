@@ -9,7 +9,7 @@ antennas,
 
 R the covariance of the receivers under noise and clutter, the same for all transmit antennas, in
 units of the noise. Without a target 2 T is a chi-squared field of 2 L_tx degrees of freedom. Where
-clutter remains the transmit antennas hear the same of it: with c its share of the beam's power,
+clutter remains the transmit antennas receive the same of it: with c its share of the beam's power,
 c = 1 - a^H R^-2 a / a^H R^-1 a, one of the L_tx terms grows to 1 + (L_tx - 1) c, and the threshold
 with it.
 
@@ -76,7 +76,7 @@ class BeamSearch(BySchedule):
         _, level = self.rule(known).detect(power)
         left_over = Remainder.of(strong, snr, known, rest.shape)
         noise, expected = self._noise(rest, known, clutter)
-        ratio, sure, cosines = self._judge(maps, noise, expected, known, clutter, left_over)
+        ratio, sure, cosines = self._test(maps, noise, expected, known, clutter, left_over)
         found = rest / (noise + expected)
         held_up = unexplained(found, ratio > 1, self.settings, left_over.power > 0)
         ratio, sure = ratio / held_up, sure / held_up
@@ -108,7 +108,7 @@ class BeamSearch(BySchedule):
         expected = expected_power(clutter, known, len(power), TAPER)
         return noise_level(power, expected, known.channels), expected
 
-    def _judge(
+    def _test(
         self,
         maps: np.ndarray,
         noise: float,

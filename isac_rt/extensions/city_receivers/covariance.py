@@ -57,8 +57,13 @@ class Bucketed:
         strongest = tables[0].max() * tables[1].max()
         rows = w.num_range_cells + 2 * REACH
         row = np.round(beat).astype(np.int64) + REACH
-        heard = (row >= 0) & (row < rows) & (clutter.power * strongest > LEAST_WEIGHT * noise)
-        clutter, beat, doppler, row = clutter.select(heard), beat[heard], doppler[heard], row[heard]
+        received = (row >= 0) & (row < rows) & (clutter.power * strongest > LEAST_WEIGHT * noise)
+        clutter, beat, doppler, row = (
+            clutter.select(received),
+            beat[received],
+            doppler[received],
+            row[received],
+        )
         column = np.round(doppler).astype(np.int64)
         bucket = row * w.num_chirps + column % w.num_chirps
         share = (clutter.power / noise).astype(np.float32)

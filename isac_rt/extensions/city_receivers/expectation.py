@@ -21,8 +21,8 @@ from isac_rt.propagation.clutter.cells import Density
 from isac_rt.propagation.clutter.field import ClutterField, Seen
 from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.clutter.two_bounces import SeenByMirror, TwoBounces
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.propagation.settings import Clutter
-from isac_rt.propagation.ways import LinkState
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.track.expectation import ClutterExpectation, Mistakes
@@ -90,7 +90,7 @@ class MeshExpectation:
                 self._expected(
                     part, error, amplitude * state.elements(self._antennas, part.seen), local
                 )
-                for part in self._ways(self._own.seen(state), own.face, mirrored, error)
+                for part in self._paths(self._own.seen(state), own.face, mirrored, error)
             ]
         )
 
@@ -140,32 +140,32 @@ class MeshExpectation:
         mirrored = [] if self._two_bounces is None else self._two_bounces.from_places(state)
         parts = []
         once, every = self._field.from_places(state), self._field.cells
-        for part in self._ways(once, every.face, mirrored, error):
-            heard = self._antennas.element_gain(end.to_body(part.seen.arrival))
-            gain = np.sqrt(self._antennas.gain * heard)
+        for part in self._paths(once, every.face, mirrored, error):
+            received = self._antennas.element_gain(end.to_body(part.seen.arrival))
+            gain = np.sqrt(self._antennas.gain * received)
             parts.append(self._expected(part, error, amplitude * gain, end))
         return ExpectedClutter.joined(parts)
 
-    def _ways(
+    def _paths(
         self,
         once: Seen,
         face: np.ndarray,
         mirrored: Sequence[SeenByMirror],
         error: np.ndarray | None,
-    ) -> Iterator[_Way]:
+    ) -> Iterator[_Path]:
         """Ways of one bounce by cells on faces (N,), and by way of mirrors, whose faces are in
         error along their normals."""
-        yield _Way(once, face[once.index], once.departure, once.arrival)
+        yield _Path(once, face[once.index], once.departure, once.arrival)
         for part in mirrored:
             n, s = part.mirror.normal, part.seen
             met = s.departure if part.before else s.arrival
             turned = mirror_image(met, n)  # the way from the mirror to the scatterer
             there, back = (turned, s.arrival) if part.before else (s.departure, turned)
             moved = 0.0 if error is None else 2 * error[part.mirror.faces[0]] * (met @ n)
-            yield _Way(s, self._field.cells.face[s.index], there, back, moved)
+            yield _Path(s, self._field.cells.face[s.index], there, back, moved)
 
     def _expected(
-        self, part: _Way, error: np.ndarray | None, amplitude: np.ndarray, axes: Pose
+        self, part: _Path, error: np.ndarray | None, amplitude: np.ndarray, axes: Pose
     ) -> ExpectedClutter:
         """Clutter of amplitudes (K,) where antennas were isotropic, on faces that are each in
         error; directions in the body's axes of a pose."""
@@ -185,7 +185,7 @@ class MeshExpectation:
         )
 
 
-class _Way(NamedTuple):
+class _Path(NamedTuple):
     """Paths over K scatterers on faces (K,): unit vectors (K, 3) at which both segments meet them,
     and the error of their length where a mirror is in error [m]."""
 

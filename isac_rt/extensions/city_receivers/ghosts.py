@@ -4,11 +4,11 @@ truth.
 A wall shows each UAV again, as a mirror does. Two questions are asked of a track, and either is
 enough to make it suspect:
 
-- Is it one of the echoes that a nearer body must have over walls? There (straight) and back (over
+- Is it one of the echoes that a nearer UAV must have over walls? There (straight) and back (over
   a wall), the reverse, or over a wall on both ways: their ranges, rates and directions follow from
   the source's state and the wall's plane. An echo over a wall is always longer than the direct one,
   and so weaker; being farther stands here for being weaker. The body is another track, or one that
-  the terminal was told of: a UAV that the line of sight masks is heard by its echoes over walls.
+  the terminal was told of: a UAV that the line of sight masks is received by its echoes over walls.
 - Does it lie behind a surface of the mesh? No UAV there could be seen straight.
 
 A passive terminal asks the same of its reflectors, whose echoes come from its reference, the active
@@ -37,8 +37,8 @@ RESOLUTION_SHARE = 0.5
 """Share of the resolution that it may be off besides: echoes that share a cell pull each other's
 estimates."""
 ECHOED_FRAMES = 3
-"""So many frames in a row a confirmed track fits a nearer body's echo, or lies behind a wall,
-before it ends: the body may be known only after its echo was confirmed, the place only then well
+"""So many frames in a row a confirmed track fits a nearer UAV's echo, or lies behind a wall,
+before it ends: the UAV may be known only after its echo was confirmed, the place only then well
 enough, and a UAV may cross the place of another one's echo."""
 CROSSING_M = 3.0
 """Confirmed tracks are held against the walls so near to them [m]: one that lay before all walls
@@ -165,7 +165,7 @@ def suspicion(
     own: Pose,
     walls: Walls,
     leeway: Leeway,
-    told: TrackSet | None = None,
+    reported: TrackSet | None = None,
     asked: np.ndarray | None = None,
 ) -> Suspicion:
     """Hold the tracks of a terminal against the mesh.
@@ -177,7 +177,7 @@ def suspicion(
     own : its pose
     walls : the mesh
     leeway : what detections leave open
-    told : likewise, bodies that others say there are; with the same reference. Those that are not
+    reported : likewise, UAVs that other terminals report, with the same reference. Those not
         known to a resolution would explain anything, and are left out
     asked : (K,) bool, the tracks that may lie behind a wall; None: all but the reference
     """
@@ -200,9 +200,9 @@ def suspicion(
             leeway.resolution[0],
         )
     sources = [(tracks, int(s)) for s in np.flatnonzero(tracks.confirmed & (out.behind < 0))]
-    if told is not None:
-        sure = (told.std < leeway.resolution).all(axis=1)
-        sources += [(told, int(s)) for s in np.flatnonzero(sure & ~told.is_reference)]
+    if reported is not None:
+        sure = (reported.std < leeway.resolution).all(axis=1)
+        sources += [(reported, int(s)) for s in np.flatnonzero(sure & ~reported.is_reference)]
     reach = 2 * float(np.max(tracks.range, initial=0.0)) + 1
     for known, s in sources:
         if sender is None:
@@ -214,8 +214,8 @@ def suspicion(
             continue
         std = np.hypot(tracks.std, known.std[s])
         may_be = ~tracks.is_reference & (tracks.range > known.range[s])
-        if known is told:  # a track of the body itself is no echo of it
-            may_be &= ~leeway.explained(measured - told.measured[s], std)
+        if known is reported:  # a track of the UAV itself is no echo of it
+            may_be &= ~leeway.explained(measured - reported.measured[s], std)
         faces, orders, ways = (np.array(of) for of in zip(*shown, strict=True))
         one_way = (orders == 1) & (sender is None)
         hit = leeway.explained(measured[:, None] - ways, std[:, None], one_way) & may_be[:, None]
@@ -232,9 +232,9 @@ def echoes(
     u_z), images beyond `reach` [m] left out.
 
     `state` (6,) is position and velocity relative to the terminal, world axes. Over the wall on
-    both ways the echo is the image's. Over it on one way two equal waves arrive, from the body and
+    both ways the echo is the image's. Over it on one way two equal waves arrive, from the UAV and
     from the image, at the mean of the two ranges; where the virtual array, which adds the phases of
-    both ways, points then is left open: at the body, at the image or midway.
+    both ways, points then is left open: at the UAV, at the image or midway.
     """
     here = np.concatenate([own.position, own.velocity])
     body = state + here
@@ -260,9 +260,9 @@ def reflections(
     (first face, order, (4,) path length, its rate, u_x, u_z), images beyond `reach` [m] of either
     end left out.
 
-    `state` and `sender` (6,) are the body's and the active terminal's, relative to the own pose.
-    With `sender` None the body is the active terminal itself: its line of sight over a wall. The
-    wave comes from the body, or from its image in the last wall.
+    `state` and `sender` (6,) are the UAV's and the active terminal's, relative to the own pose.
+    With `sender` None the UAV is the active terminal itself: its line of sight over a wall. The
+    wave comes from the UAV, or from its image in the last wall.
     """
     here = np.concatenate([own.position, own.velocity])
     body = state + here
@@ -270,10 +270,10 @@ def reflections(
     if sender is None:
         return [(face, 1, measure(image, own)) for face, image in back[1:]]
     start, out = sender + here, []
-    heard = [(face, measure(seen, own)) for face, seen in back]
+    received = [(face, measure(seen, own)) for face, seen in back]
     for first, image in [(-1, body), *_images(body, start, walls, reach)]:
         way = np.append(lengths(image[None], start)[0], [0.0, 0.0])
-        for last, seen in heard:
+        for last, seen in received:
             order = (first >= 0) + (last >= 0)
             if order:
                 out.append((first if first >= 0 else last, order, seen + way))
@@ -283,7 +283,7 @@ def reflections(
 def _images(
     body: np.ndarray, end: np.ndarray, walls: Walls, reach: float
 ) -> list[tuple[int, np.ndarray]]:
-    """Mirror images (6,) of a body (6,) in the walls that show it to an end (6,) within reach [m],
+    """Mirror images (6,) of a UAV (6,) in the walls that show it to an end (6,) within reach [m],
     world coordinates, with the walls' faces."""
     mirrors, images = walls.images(body, end, reach, MEETING)
     return [(int(walls.mirrors[0][k]), image) for k, image in zip(mirrors, images, strict=True)]

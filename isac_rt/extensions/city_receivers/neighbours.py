@@ -93,14 +93,14 @@ def phases(
     sums = np.zeros((BLOCKS, first.size), complex)
     rows, columns = np.nonzero(usable)
     block = rows * BLOCKS // shape[0]
-    heard = channels[:, rows, columns]
+    received = channels[:, rows, columns]
     for one in np.unique(axis):
         pairs = np.flatnonzero(axis == one)
         apart = float(places[second[pairs[0]], one] - places[first[pairs[0]], one])
         gamma = coherence(clutter, known, int(one), apart, shape)[rows, columns]
         weight = gamma.conj() / mean[rows, columns] ** 2
         for q in pairs:
-            product = heard[first[q]].conj() * heard[second[q]] * weight
+            product = received[first[q]].conj() * received[second[q]] * weight
             sums[:, q] = np.bincount(block, product.real, BLOCKS) + 1j * np.bincount(
                 block, product.imag, BLOCKS
             )

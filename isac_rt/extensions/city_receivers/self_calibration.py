@@ -8,14 +8,14 @@ An echo at the active terminal has in the channel of transmit element t and rece
 with the array's response s towards u, complex logarithms of the elements' gains, their slopes over
 the chirp (a delay is an imaginary one), and a response that is common to all. At a passive terminal
 every transmit element has an amplitude A of its own, for it is another terminal's. Samples are
-corrected by what is known so far; what a look still shows is the correction of that.
+corrected by what is known so far; what a measured path still shows is the correction of that.
 
 Amplitudes and phases are two Gaussians of independent elements, carried in information form, so
-that what no look tells stays as the prior has it: the common gain and phase and, where the
-direction of a look is not known from elsewhere, what turns all directions alike. The amplitude of a
-look, its delay and its direction are nuisances of each look anew, of which the direction has the
-deviation that it is known by. The noise of a look is what its channels hold beside one wave.
-"""
+that what no measured path tells stays as the prior has it: the common gain and phase and, where the
+direction of a measured path is not known from elsewhere, what turns all directions alike. The
+amplitude of a measured path, its delay and its direction are nuisances of each measured path anew,
+of which the direction has the deviation that it is known by. The noise of a measured path is what
+its channels hold beside one wave."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.modes import MODES, polynomials
-from isac_rt.receive.types import Look, Neighbours
+from isac_rt.receive.types import Neighbours, PathChannels
 from isac_rt.track.parts import HardwareModel
 
 GAIN_STD = 0.2, 0.6
-"""Before the first look: logarithm of an element's amplitude (1.7 dB) and phase [rad] (34
+"""Before the first measured path: logarithm of an element's amplitude (1.7 dB) and phase [rad] (34
 degrees)."""
 SLOPE_STD = 0.1
 """Of both, over the chirp."""
@@ -48,29 +48,29 @@ DRIFT = 0.01
 CLOCK_DRIFT = 1e-12, 1e-10
 """The same of delay [s] and rate."""
 FREE = 0.2
-"""Deviation of a direction cosine that the look itself is to find."""
+"""Deviation of a direction cosine that the measured path itself is to find."""
 CELLS = 0.02
 """Share of a cell to which a path's delay and rate are measured at best."""
 ROUNDS = 5
 LEAST_SNR = 1.0
-"""Of a channel, under which a look says nothing."""
+"""Of a channel, under which a measured path says nothing."""
 FLOOR = 1e-4
 """Least noise of a channel over its power: what plane waves and seven range rows leave out."""
 LEAST_PHASE, MESH_PHASE = 0.01, 0.05
 """Of neighbouring channels as clutter shows them [rad]: the least deviation that is believed, and
 what a mesh and the power of its scatterers are off by."""
 MISFIT = 1.5
-"""Misfit beyond what chance makes, from which on a look counts for less."""
+"""Misfit beyond what chance makes, from which on a measured path counts for less."""
 
 
-class Sight(NamedTuple):
+class KnownDirection(NamedTuple):
     """From where a path is known to come.
 
     Attributes
     ----------
     direction : (2,) u_x, u_z
     radius : of its wavefront [m]
-    direction_std : of both cosines; `FREE`: the look is to find them
+    direction_std : of both cosines; `FREE`: the measured path is to find them
     path : delay, delay rate and the deviations of both [s, 1, s, 1]; None where not known
     """
 
@@ -211,88 +211,92 @@ class SelfCalibration(HardwareModel):
         table = np.exp(-(each + shared)).astype(np.complex64)
         return table.reshape(-1, self._antennas.num_rx, w.num_samples)
 
-    # ---- looks
+    # ---- measured paths
 
     def learn_all(
-        self, seen: Sequence[tuple[Look, Sight]], neighbours: Neighbours | None = None
+        self,
+        seen: Sequence[tuple[PathChannels, KnownDirection]],
+        neighbours: Neighbours | None = None,
     ) -> Change:
-        """Take in the looks of a frame and what clutter shows of neighbouring channels, and say how
-        paths are seen otherwise from now on."""
+        """Take in the measured paths of a frame and what clutter shows of neighbouring channels,
+        and say how paths are seen otherwise from now on."""
         before, clock = self.state.gains.value[1], self.state.clock
-        for look, sight in seen:
-            self.learn(look, sight)
+        for measured, known_direction in seen:
+            self.learn(measured, known_direction)
         if neighbours is not None:
             self._learn_of_neighbours(neighbours)
         change = self.state.gains.value[1] - before
-        _, across = self._steering(Sight(np.zeros(2), np.inf, FREE))
+        _, across = self._steering(KnownDirection(np.zeros(2), np.inf, FREE))
         lines = np.linalg.pinv(np.hstack([self._amplitudes, across]))[-2:] @ self._elements
         delay, rate = self.state.clock - clock
         spread = np.sqrt(np.mean(change**2) * (lines**2).sum(axis=1))
         return Change(delay, rate, lines @ change, spread)
 
-    def learn(self, look: Look, sight: Sight) -> None:
-        """Take in a look at corrected samples."""
-        towards, across = self._steering(sight)
+    def learn(self, measured: PathChannels, known_direction: KnownDirection) -> None:
+        """Take in a measured path at corrected samples."""
+        towards, across = self._steering(known_direction)
         gains, slopes, common, clock = (
             now - then for now, then in zip(self._known(), self._taken_out, strict=True)
         )
         left_out = self._elements @ (gains[0] + 1j * gains[1])
-        modes = look.modes.reshape(MODES, -1) * np.exp(-left_out) * towards.conj()
+        modes = measured.modes.reshape(MODES, -1) * np.exp(-left_out) * towards.conj()
         power = float(np.mean(np.abs(modes[0]) ** 2))
-        noise = max(self._noise(modes[0], look.snr), FLOOR * power)
+        noise = max(self._noise(modes[0], measured.snr), FLOOR * power)
         if noise * LEAST_SNR >= power:
             return
-        fitted = self._fit(modes[0], noise, across, sight.direction_std)
+        fitted = self._fit(modes[0], noise, across, known_direction.direction_std)
         if fitted.misfit > MISFIT:
             noise *= fitted.misfit
-            fitted = self._fit(modes[0], noise, across, sight.direction_std)
+            fitted = self._fit(modes[0], noise, across, known_direction.direction_std)
         self.state.gains = fitted.gains
         weight = 2 * np.abs(fitted.wave) ** 2 / noise
         left = modes[1:] / fitted.wave - (common[0] + 1j * common[1])[1:, None]
         left[0] -= self._elements @ (slopes[0] + 1j * slopes[1])
         self._learn_response(left, weight)
-        self._learn_clock(look, sight, clock)
+        self._learn_clock(measured, known_direction, clock)
 
-    def _steering(self, sight: Sight) -> tuple[np.ndarray, np.ndarray]:
+    def _steering(self, known_direction: KnownDirection) -> tuple[np.ndarray, np.ndarray]:
         """Response (C,) of the channels to a wave, and its phase's derivative (C, 2) with respect
         to u_x and u_z."""
         turn = 2 * np.pi * self.waveform.effective_carrier
         a = self._antennas
-        rx, d_rx = element_delays(a.rx_positions, sight.direction, sight.radius)
+        rx, d_rx = element_delays(a.rx_positions, known_direction.direction, known_direction.radius)
         tx, d_tx = np.zeros(a.num_tx), np.zeros((2, a.num_tx))
         if self._passes == 2:
-            tx, d_tx = element_delays(a.tx_positions, sight.direction, sight.radius)
+            tx, d_tx = element_delays(
+                a.tx_positions, known_direction.direction, known_direction.radius
+            )
         phase = turn * (tx[:, None] + rx).ravel()
         across = turn * (d_tx[:, :, None] + d_rx[:, None]).reshape(2, -1)
         return np.exp(1j * phase), across.T
 
-    def _noise(self, heard: np.ndarray, snr: float) -> float:
+    def _noise(self, received: np.ndarray, snr: float) -> float:
         """Power of a channel that is not of one wave: whatever the elements do to a wave, it stays
         a matrix of rank one."""
-        by_antenna = heard.reshape(self._antennas.num_tx, -1)
+        by_antenna = received.reshape(self._antennas.num_tx, -1)
         free = (by_antenna.shape[0] - 1) * (by_antenna.shape[1] - 1)
         if free == 0:
-            return float(np.mean(np.abs(heard) ** 2)) / max(snr, 1.0)
+            return float(np.mean(np.abs(received) ** 2)) / max(snr, 1.0)
         others = np.linalg.svd(by_antenna, compute_uv=False)[1:]
         return float((others**2).sum()) / free
 
     def _fit(
-        self, heard: np.ndarray, noise: float, across: np.ndarray, direction_std: float
+        self, received: np.ndarray, noise: float, across: np.ndarray, direction_std: float
     ) -> _Fitted:
-        """The most likely gains with a look (C,) whose direction has been taken out, by Gauss and
-        Newton."""
+        """The most likely gains with a measured path (C,) whose direction has been taken out, by
+        Gauss and Newton."""
         E, B, K = self._elements, self._amplitudes, self._elements.shape[1]
         X = np.hstack([E, B]), np.hstack([E, B, across])
         priors = [_padded(self.state.gains.information[i], X[i].shape[1]) for i in (0, 1)]
         priors[1][-2:, -2:] = np.eye(2) / direction_std**2
         at = [np.zeros(x.shape[1]) for x in X]
-        wave = heard
+        wave = received
         for _ in range(ROUNDS):
             model = np.exp(E @ at[0][:K] + 1j * (E @ at[1][:K] + across @ at[1][-2:]))
             power = B.T @ np.abs(model) ** 2
-            wave = model * (B @ (B.T @ (heard * model.conj()) / power))
+            wave = model * (B @ (B.T @ (received * model.conj()) / power))
             weight = 2 * np.abs(wave) ** 2 / noise
-            left = heard / wave - 1
+            left = received / wave - 1
             for i, part in enumerate((left.real, left.imag)):
                 at[i][K : K + B.shape[1]] = 0  # the amplitude has just been fitted
                 total = part + X[i] @ at[i]
@@ -303,12 +307,12 @@ class SelfCalibration(HardwareModel):
             cost += float(weight @ part**2 + at[i] @ priors[i] @ at[i])
             after.append(_marginal(priors[i] + (X[i].T * weight) @ X[i], K))
         value = self.state.gains.value + np.stack([a[:K] for a in at])
-        misfit = cost / (2 * max(len(heard) - B.shape[1], 1))
+        misfit = cost / (2 * max(len(received) - B.shape[1], 1))
         return _Fitted(Belief(value, np.stack(after)), wave, misfit)
 
     def _learn_response(self, left: np.ndarray, weight: np.ndarray) -> None:
         """Slopes of the elements, and what all have in common, from the modes (3, C) of degree 1 to
-        3 over a look's wave."""
+        3 over a measured path's wave."""
         K = self._elements.shape[1]
         X = np.hstack([self._elements, self._amplitudes])
         steps, after = [], []
@@ -339,13 +343,15 @@ class SelfCalibration(HardwareModel):
         value = self.state.gains.value + np.stack([0 * step, step])
         self.state.gains = Belief(value, np.stack([own[0], full]))
 
-    def _learn_clock(self, look: Look, sight: Sight, learnt: np.ndarray) -> None:
+    def _learn_clock(
+        self, measured: PathChannels, known_direction: KnownDirection, learnt: np.ndarray
+    ) -> None:
         """By how much the path comes late, of which the frame's samples still hold what it has
         `learnt`."""
-        if sight.path is None:
+        if known_direction.path is None:
             return
-        delay, rate, *std = sight.path
-        left = np.array([look.delay - delay, look.delay_rate - rate]) - learnt
+        delay, rate, *std = known_direction.path
+        left = np.array([measured.delay - delay, measured.delay_rate - rate]) - learnt
         best = CELLS * np.array([self.waveform.delay_step, self._rate_cell])
         P = self.state.clock_covariance
         gain = P @ np.linalg.inv(P + np.diag(np.square(std) + best**2))
@@ -358,7 +364,7 @@ class SelfCalibration(HardwareModel):
 
 
 class _Fitted(NamedTuple):
-    """Gains after a look, its wave (C,), and how much worse than its noise it fits."""
+    """Gains after a measured path, its wave (C,), and how much worse than its noise it fits."""
 
     gains: Belief
     wave: np.ndarray

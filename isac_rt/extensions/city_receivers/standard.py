@@ -10,9 +10,9 @@ import numpy as np
 
 from isac_rt.extensions.city_receivers.ghosts import Ghosts, Leeway
 from isac_rt.extensions.city_receivers.images import Images
-from isac_rt.extensions.city_receivers.retrospect import Retrospect
-from isac_rt.extensions.city_receivers.sights import LearnedHardware
-from isac_rt.extensions.city_receivers.standing import Standing, rests
+from isac_rt.extensions.city_receivers.known_paths import LearnedHardware
+from isac_rt.extensions.city_receivers.out_of_sequence import OutOfSequence
+from isac_rt.extensions.city_receivers.static_clutter import StaticClutter, rests
 from isac_rt.extensions.city_receivers.waits import AwaitedReports, PlacedTransmitter
 from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas
@@ -128,7 +128,7 @@ def _passive_equipment(
     other_paths = OtherPaths()
     if receivers.link_acquisition == "blind":
         receiver = PassiveReceiver.of(antennas, receivers, dpsk_order, groups)
-        other_paths = Retrospect(receiver, waveform, walls)
+        other_paths = OutOfSequence(receiver, waveform, walls)
     hardware = _hardware(receivers, waveform, antennas, 1)
     return Equipment(rules, hardware, other_paths, expect_clutter=clutter)
 
@@ -140,7 +140,7 @@ def _rules_of_walls(
     return [
         Images(walls, antennas, waveform, passes),
         Ghosts(walls, Leeway.of(waveform, antennas, passes)),
-        Standing.of(antennas, waveform, passes, walls),
+        StaticClutter.of(antennas, waveform, passes, walls),
     ]
 
 
@@ -156,10 +156,10 @@ def expected_targets(tracker: Tracker, own: Own) -> Gates:
     """Return where tracks that move, and other terminals by their reports, are expected. What is
     static may be a wall that the mesh lacks, whose clutter nothing whitens."""
     error = of_itself(own.pose).covariance
-    mates = [
+    reported_poses = [
         Track.of_body(Gaussian(body.state.mean, body.state.covariance + error)).state
         for body in own.reports
         if body.terminal
     ]
     moving = [t.state for t in tracker.tracks if not rests(t)]
-    return Gates(*reported(moving + mates, own.pose))
+    return Gates(*reported(moving + reported_poses, own.pose))

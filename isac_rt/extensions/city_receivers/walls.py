@@ -101,7 +101,7 @@ class Walls:
         edge: float,
         among: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mirrors (K,) that show a body (6,) to an `end` (6,) within `reach` [m], and
+        """Return the mirrors (K,) that show a UAV (6,) to an `end` (6,) within `reach` [m], and
         its images in them (K, 6), positions and velocities in world coordinates.
 
         Parameters
@@ -145,7 +145,7 @@ class Walls:
 
 
 def lengths(bodies: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return length and its rate (K, 2) of straight paths from moving bodies (K, 6) to `end`
+    """Return length and its rate (K, 2) of straight paths from moving UAVs (K, 6) to `end`
     (6,)."""
     span, moved = end[:3] - bodies[:, :3], end[3:6] - bodies[:, 3:6]
     far = np.linalg.norm(span, axis=1)

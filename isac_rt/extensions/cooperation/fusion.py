@@ -1,9 +1,9 @@
-"""One picture from the tracks of several terminals: which of them are one body, what they say of it
-together, and its name in the whole swarm.
+"""One set of fused tracks from the tracks of several terminals: which of them are one UAV, what
+they say of it together, and its name in the whole swarm.
 
 A terminal is wrong about its own pose and clock, and so about all its tracks alike. These errors
-are states beside the bodies: what two terminals see, and what they say of themselves, tells them,
-and that helps all other bodies. What else tracks have in common is not known: they follow the same
+are states beside the UAVs: what two terminals see, and what they say of themselves, tells them,
+and that helps all other UAVs. What else tracks have in common is not known: they follow the same
 manoeuvres, and may rest on one transmitter's pose. Covariance intersection is consistent whatever
 it is.
 """
@@ -28,10 +28,10 @@ from isac_rt.track.tracker import LEAST_APART, TrackSet, assign
 from isac_rt.world.swarm import Pose
 
 SIZE = 6
-"""Position and velocity in world axes [m, m/s]: what terminals tell each other of a body."""
+"""Position and velocity in world axes [m, m/s]: what terminals tell each other of a UAV."""
 DATUM_STD = (0.05, 0.05)
-"""And of what all terminals are wrong alike, for they hear the same satellites [m, m/s]: nothing
-that they tell each other shows it, and all bodies of a picture have it."""
+"""And of what all terminals are wrong alike, for they receive the same satellites [m, m/s]: nothing
+that they tell each other shows it, and all UAVs of a set of fused tracks have it."""
 _DATUM = np.diag(np.repeat(np.square(DATUM_STD), 3))
 ATTITUDE_STD = np.radians(0.3)
 """Deviation of a terminal's attitude about each axis [rad]: across the line of sight, times the
@@ -50,7 +50,7 @@ MASKED_CELLS = 3.0
 pushed away from it: by the line's sidelobes, and by what is left where these were taken out."""
 PULL = 0.5
 """Range cells of that push. It is alike from frame to frame, so that a track's own deviation knows
-nothing of it. Near the line of sight a metre of path length moves a body by thirty and more."""
+nothing of it. Near the line of sight a metre of path length moves a UAV by thirty and more."""
 MOST_PULLED = 1e6
 """On the line of sight a metre moves it by infinitely many. So many say as much as that nothing is
 known of it along its direction, and leave the digits of its covariance across it."""
@@ -58,7 +58,7 @@ SAME_M = 1e-9
 """Lengths that differ by less are the same [m]."""
 
 
-class Told(NamedTuple):
+class Reported(NamedTuple):
     """Reported target in world axes: its position and velocity (6,), covariance (6, 6) without the
     reporter's errors, and (6, `ERRORS`) the effect of these errors, one deviation each."""
 
@@ -70,11 +70,11 @@ class Told(NamedTuple):
         """The state with the errors of who tells."""
         return Gaussian(self.state.mean, self.state.covariance + self.lever @ self.lever.T)
 
-    def after(self, interval: float, acceleration_std: float) -> Told:
+    def after(self, interval: float, acceleration_std: float) -> Reported:
         """The same an interval [s] later."""
         lever = self.lever.copy()
         lever[:3] += interval * lever[3:]
-        return Told(advance(self.state, interval, acceleration_std), lever)
+        return Reported(advance(self.state, interval, acceleration_std), lever)
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,9 @@ class Report:
     ----------
     key : the track
     since : when it was confirmed [s]
-    name : by which it knows the body
+    name : by which it knows the UAV
     time : that the state is of [s]
-    state, lever : as in `Told`; by default the errors of who tells do nothing
+    state, lever : as in `Reported`; by default the errors of who tells do nothing
     """
 
     key: Key
@@ -105,11 +105,11 @@ class Report:
     @cached_property
     def whole(self) -> Gaussian:
         """The state with the errors of who tells."""
-        return Told(self.state, self.lever).whole
+        return Reported(self.state, self.lever).whole
 
 
 def at_once(reports: Iterable[Report], time: float, acceleration_std: float) -> list[Report]:
-    """Reports at one time [s]: `Told.after` of each."""
+    """Reports at one time [s]: `Reported.after` of each."""
     some = list(reports)
     if not some:
         return []
@@ -147,7 +147,7 @@ def _coasting(interval: float, acceleration_std: float) -> tuple[np.ndarray, np.
 
 def in_world(
     tracks: TrackSet, row: int, own: Pose, clock_std: float = 0.0, cell: float = 0.0
-) -> Told:
+) -> Reported:
     """A track as it is told to others: its own covariance, and apart from it what the errors of the
     terminal do to it: of its position and velocity (`POSE_STD`), of its attitude (`ATTITUDE_STD`),
     which turns place and motion about the terminal, and of its clock (`clock_std`, the speed of
@@ -158,7 +158,7 @@ def in_world(
         baseline = tracks.mean[tracks.is_reference.argmax(), :3]
     pulled, lever = _levers(tracks.mean[row], baseline, clock_std, cell)
     mean = tracks.mean[row] + np.concatenate([own.position, own.velocity])
-    return Told(Gaussian(mean, tracks.covariance[row] + np.outer(pulled, pulled)), lever)
+    return Reported(Gaussian(mean, tracks.covariance[row] + np.outer(pulled, pulled)), lever)
 
 
 def _levers(
@@ -196,8 +196,8 @@ def _by_length(offset: np.ndarray, baseline: np.ndarray, masked: float) -> np.nd
         return np.zeros(3)
     u = offset / rho
     # of rho = (L^2 - d^2) / (2 (L - d.u)) by L; on the line of sight L = d.u
-    room = max(length - float(baseline @ u), (length - rho) / MOST_PULLED, SAME_M)
-    return u * (length - rho) / room
+    apart_m = max(length - float(baseline @ u), (length - rho) / MOST_PULLED, SAME_M)
+    return u * (length - rho) / apart_m
 
 
 def _by_clock(offset: np.ndarray, baseline: np.ndarray) -> np.ndarray:
@@ -215,15 +215,15 @@ def _by_clock(offset: np.ndarray, baseline: np.ndarray) -> np.ndarray:
     return u * (length - d - rho * (1 - ahead / d)) / (length - ahead)
 
 
-def its_word(said: Gaussian) -> Told:
+def report_of(report_: Gaussian) -> Reported:
     """The same (`of_itself`) with the errors of its pose apart."""
     lever = np.zeros((SIZE, ERRORS))
     lever[range(SIZE), range(SIZE)] = np.repeat(POSE_STD, 3)
-    return Told(Gaussian(said.mean, OWN_NOISE**2 * np.eye(SIZE)), lever)
+    return Reported(Gaussian(report_.mean, OWN_NOISE**2 * np.eye(SIZE)), lever)
 
 
 def in_datum(state: Gaussian) -> Gaussian:
-    """A body (6,) with what all terminals are wrong alike."""
+    """A UAV (6,) with what all terminals are wrong alike."""
     return Gaussian(state.mean, state.covariance + _DATUM)
 
 
@@ -299,12 +299,12 @@ def _intersected(states: Sequence[Gaussian]) -> tuple[Gaussian, np.ndarray]:
 
 
 def together(
-    bodies: Sequence[Sequence[Report]], itself: Mapping[int, tuple[str, Told]]
+    uavs: Sequence[Sequence[Report]], itself: Mapping[int, tuple[str, Reported]]
 ) -> list[Gaussian]:
-    r"""Bodies from their tracks, jointly with the errors of the terminals that tell of them.
+    r"""UAVs from their tracks, jointly with the errors of the terminals that tell of them.
 
     A track says :math:`y = b + L_y e + n` with the errors e of its terminal, one deviation each and
-    independent of all else, and with its own error n. Of the n of one body the correlation is not
+    independent of all else, and with its own error n. Of the n of one UAV the correlation is not
     known: each has the weight w of covariance intersection, which is consistent whatever it is. The
     information of all, of the errors' own and of what terminals say of themselves is added up:
 
@@ -312,51 +312,51 @@ def together(
 
     Parameters
     ----------
-    bodies : by body the reports of its tracks, all of one instant
-    itself : by number of a body the terminal that it is, and what that one says of itself
+    uavs : by body the reports of its tracks, all of one instant
+    itself : by number of a UAV the terminal that it is, and what that one says of itself
     """
-    if not bodies:
+    if not uavs:
         return []
     owners = {name for name, _ in itself.values()}
-    owners |= {_teller(report.key) for reports in bodies for report in reports}
-    links = dict.fromkeys(report.key.origin for reports in bodies for report in reports)
+    owners |= {_teller(report.key) for reports in uavs for report in reports}
+    links = dict.fromkeys(report.key.origin for reports in uavs for report in reports)
     count = ERRORS - 1
     of_pose = {name: range(count * k, count * (k + 1)) for k, name in enumerate(sorted(owners))}
     size = count * len(of_pose)
     clock = {origin: size + k for k, origin in enumerate(links)}
     size += len(clock)
-    words: list[tuple[int, list[int], Told, float]] = []
-    for k, reports in enumerate(bodies):
+    words: list[tuple[int, list[int], Reported, float]] = []
+    for k, reports in enumerate(uavs):
         _, weights = _intersected([report.whole for report in reports])
         for report, w in zip(reports, weights, strict=True):
             errors = [*of_pose[_teller(report.key)], clock[report.key.origin]]
-            words.append((k, errors, Told(report.state, report.lever), w))
+            words.append((k, errors, Reported(report.state, report.lever), w))
     # no clock is in a terminal's word of itself
     words += [(k, [*of_pose[name], size], word, 1.0) for k, (name, word) in itself.items()]
-    return _solved(len(bodies), size, words)
+    return _solved(len(uavs), size, words)
 
 
 def _solved(
-    num_bodies: int, num_errors: int, words: Sequence[tuple[int, list[int], Told, float]]
+    num_uavs: int, num_errors: int, words: Sequence[tuple[int, list[int], Reported, float]]
 ) -> list[Gaussian]:
-    """The bodies of `together`, whose information of each other is by way of the errors alone: the
-    errors first, then each body.
+    """The UAVs of `together`, whose information of each other is by way of the errors alone: the
+    errors first, then each UAV.
 
     Parameters
     ----------
-    words : a body's number, the numbers of the errors in what is told of it (`num_errors`: one that
+    words : a UAV's number, the numbers of the errors in what is told of it (`num_errors`: one that
         is in none), what is told, and its weight
     """
-    numbers, errors, told, weights = zip(*words, strict=True)
+    numbers, errors, reported_to, weights = zip(*words, strict=True)
     given = [np.array(numbers), np.array(errors), np.array(weights, float)]
-    states = [[t.state.mean for t in told], [t.state.covariance for t in told]]
-    arrays = [np.array(of) for of in (*states, [t.lever for t in told])]
-    every = _solution(num_bodies, num_errors + 1, *given, *arrays)
+    states = [[t.state.mean for t in reported_to], [t.state.covariance for t in reported_to]]
+    arrays = [np.array(of) for of in (*states, [t.lever for t in reported_to])]
+    every = _solution(num_uavs, num_errors + 1, *given, *arrays)
     return [Gaussian(m, p) for m, p in zip(*every, strict=True)]
 
 
 def _solution(
-    num_bodies: int,
+    num_uavs: int,
     num_errors: int,
     numbers: np.ndarray,
     errors: np.ndarray,
@@ -365,9 +365,9 @@ def _solution(
     covariances: np.ndarray,
     levers: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Means and covariances of the bodies from W words, of which the last error is in none."""
-    B, b = np.zeros((num_bodies, SIZE, SIZE)), np.zeros((num_bodies, SIZE))
-    C = np.zeros((num_bodies, num_errors, SIZE))
+    """Means and covariances of the UAVs from W words, of which the last error is in none."""
+    B, b = np.zeros((num_uavs, SIZE, SIZE)), np.zeros((num_uavs, SIZE))
+    C = np.zeros((num_uavs, num_errors, SIZE))
     E, e = np.eye(num_errors), np.zeros(num_errors)
     A = np.concatenate([np.broadcast_to(np.eye(SIZE), (len(levers), SIZE, SIZE)), levers], axis=2)
     gain = weights[:, None, None] * np.swapaxes(np.linalg.solve(covariances, A), 1, 2)
@@ -423,12 +423,12 @@ def cross(e: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def gate(probability: float) -> float:
-    """Squared distance within which two estimates of one body lie with a probability."""
+    """Squared distance within which two estimates of one UAV lie with a probability."""
     return float(2 * gammaincinv(SIZE / 2, probability))
 
 
 @dataclass
-class _Body:
+class _FusedUav:
     name: Name
     members: list[Key]
 
@@ -437,21 +437,21 @@ class _Body:
 
 
 @dataclass
-class Picture(Stateful):
+class FusedTracks(Stateful):
     """Fused tracks of a listener over all tracks that it knows, with memory of which of them are
     one target, and its name."""
 
-    bodies: list[_Body] = field(default_factory=list)
+    uavs: list[_FusedUav] = field(default_factory=list)
 
     def update(
-        self, reports: Iterable[Report], known: Mapping[str, Told] | None = None
+        self, reports: Iterable[Report], known: Mapping[str, Reported] | None = None
     ) -> list[Fused]:
-        """The bodies of one instant.
+        """The UAVs of one instant.
 
         Parameters
         ----------
         reports : all of that instant (`at_once`), one per track
-        known : what terminals say of themselves (`its_word`), likewise
+        known : what terminals say of themselves (`report_of`), likewise
         """
         by_key = {report.key: report for report in reports}
         whole = {key: report.whole for key, report in by_key.items()}
@@ -460,28 +460,28 @@ class Picture(Stateful):
         self._unite(whole)
         self._call(by_key)
         known = known or {}
-        states = [intersection_of([whole[k] for k in b.members]) for b in self.bodies]
+        states = [intersection_of([whole[k] for k in b.members]) for b in self.uavs]
         whose = recognise(states, {name: word.whole for name, word in known.items()})
         itself = {k: (name, known[name]) for k, name in enumerate(whose) if name is not None}
-        if self.bodies:
-            members = [[by_key[k] for k in b.members] for b in self.bodies]
+        if self.uavs:
+            members = [[by_key[k] for k in b.members] for b in self.uavs]
             states = together(members, itself)
         return [
-            Fused(body.name, in_datum(state), tuple(body.members), terminal)
-            for body, state, terminal in zip(self.bodies, states, whose, strict=True)
+            Fused(uav.name, in_datum(state), tuple(uav.members), terminal)
+            for uav, state, terminal in zip(self.uavs, states, whose, strict=True)
         ]
 
     def _keep(self, whole: Mapping[Key, Gaussian], by_key: Mapping[Key, Report]) -> None:
-        """Bodies of the tracks that are still there: those that have left their body, and new
+        """UAVs of the tracks that are still there: those that have left their body, and new
         ones, stand alone."""
         kept, alone = [], dict.fromkeys(by_key)
-        for body in self.bodies:
-            members = [key for key in body.members if key in by_key]
+        for uav in self.uavs:
+            members = [key for key in uav.members if key in by_key]
             if not members:
                 continue
             if len(members) == 1:
-                body.members = members
-                kept.append(body)
+                uav.members = members
+                kept.append(uav)
                 del alone[members[0]]
                 continue
             members.sort(key=lambda k: float(np.trace(whole[k].covariance)))
@@ -489,22 +489,22 @@ class Picture(Stateful):
             d2, _ = distances([whole[members[0]]], [whole[k] for k in members], surely)
             surest = {k.origin: k for k in reversed(members)}
             gaps = [_gap(whole[k], whole[surest[k.origin]]) for k in members]
-            body.members = [
+            uav.members = [
                 k
                 for k, d, gap in zip(members, d2[0], gaps, strict=True)
                 if np.isfinite(d) and gap <= 2 * LEAST_APART
             ]
-            kept.append(body)
-            for key in body.members:
+            kept.append(uav)
+            for key in uav.members:
                 del alone[key]
-        self.bodies = kept + [_Body(by_key[key].name, [key]) for key in alone]
+        self.uavs = kept + [_FusedUav(by_key[key].name, [key]) for key in alone]
 
     def _join(self, whole: Mapping[Key, Gaussian]) -> None:
-        """Tracks that stand alone join bodies that their terminal has no track of, origin by
+        """Tracks that stand alone join UAVs that their terminal has no track of, origin by
         origin: as many as the gate allows, of the greatest likelihood."""
         for origin in dict.fromkeys(key.origin for key in sorted(whole)):
-            single = [b for b in self.bodies if len(b.members) == 1 and origin in b.origins()]
-            others = [b for b in self.bodies if origin not in b.origins()]
+            single = [b for b in self.uavs if len(b.members) == 1 and origin in b.origins()]
+            others = [b for b in self.uavs if origin not in b.origins()]
             if not single:
                 continue
             d2, log_det = distances(
@@ -515,38 +515,38 @@ class Picture(Stateful):
             for i, j in assign(d2 + log_det):
                 others[i].members += single[j].members
                 others[i].name = min(others[i].name, single[j].name)
-                self.bodies.remove(single[j])
+                self.uavs.remove(single[j])
 
     def _unite(self, whole: Mapping[Key, Gaussian]) -> None:
-        """Bodies of one terminal's tracks that lie nearer to each other than UAVs fly are one."""
-        states = [intersection_of([whole[k] for k in b.members]) for b in self.bodies]
+        """UAVs of one terminal's tracks that lie nearer to each other than UAVs fly are one."""
+        states = [intersection_of([whole[k] for k in b.members]) for b in self.uavs]
         d2, _ = distances(states, states, JOIN_PROBABILITY)
         gone: set[int] = set()
         for i, j in np.argwhere(np.tril(np.isfinite(d2), -1)).tolist():
             if {i, j} & gone:
                 continue
-            body, other = self.bodies[i], self.bodies[j]
-            pairs = product(body.members, other.members)
+            uav, other = self.uavs[i], self.uavs[j]
+            pairs = product(uav.members, other.members)
             gaps = [_gap(whole[a], whole[b]) for a, b in pairs if a.origin == b.origin]
             if gaps and max(gaps) < LEAST_APART:
-                other.members += body.members
-                other.name = min(body.name, other.name)
+                other.members += uav.members
+                other.name = min(uav.name, other.name)
                 gone.add(i)
-        self.bodies = [b for i, b in enumerate(self.bodies) if i not in gone]
+        self.uavs = [b for i, b in enumerate(self.uavs) if i not in gone]
 
     def _call(self, by_key: Mapping[Key, Report]) -> None:
-        """Names: the earliest that any member is known by; two bodies never have the same. The one
+        """Names: the earliest that any member is known by; two UAVs never have the same. The one
         with the track that the name is of keeps it, else the one that had it before."""
-        for body in self.bodies:
-            body.name = min(body.name, *(by_key[key].name for key in body.members))
-        holder: dict[Name, _Body] = {}
-        waiting = sorted(self.bodies, key=lambda b: Key(*b.name[1:]) not in b.members)
-        for body in waiting:
-            if body.name in holder:
-                body.name = min(by_key[key].own_name for key in body.members)
-            if body.name in holder:  # by a body that lacks the track; it takes its own in its turn
-                waiting.append(holder[body.name])
-            holder[body.name] = body
+        for uav in self.uavs:
+            uav.name = min(uav.name, *(by_key[key].name for key in uav.members))
+        holder: dict[Name, _FusedUav] = {}
+        waiting = sorted(self.uavs, key=lambda b: Key(*b.name[1:]) not in b.members)
+        for uav in waiting:
+            if uav.name in holder:
+                uav.name = min(by_key[key].own_name for key in uav.members)
+            if uav.name in holder:  # by a UAV that lacks the track; it takes its own in its turn
+                waiting.append(holder[uav.name])
+            holder[uav.name] = uav
 
 
 def _gap(a: Gaussian, b: Gaussian) -> float:
@@ -555,7 +555,7 @@ def _gap(a: Gaussian, b: Gaussian) -> float:
 
 
 def recognise(states: Sequence[Gaussian], known: Mapping[str, Gaussian]) -> list[str | None]:
-    """The terminal that each body is, by what terminals say of themselves."""
+    """The terminal that each UAV is, by what terminals say of themselves."""
     whose: list[str | None] = [None] * len(states)
     names = list(known)
     d2, log_det = distances(list(known.values()), states, JOIN_PROBABILITY)

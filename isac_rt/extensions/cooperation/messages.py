@@ -15,9 +15,16 @@ from math import ceil
 
 import numpy as np
 
-from isac_rt.extensions.city_receivers.retrospect import BATCH
-from isac_rt.extensions.cooperation.fusion import Picture, Report, Told, advance, at_once, its_word
-from isac_rt.extensions.cooperation.pool import Look, PooledTracker
+from isac_rt.extensions.city_receivers.out_of_sequence import BATCH
+from isac_rt.extensions.cooperation.centralised import CentralisedTracker, Scan
+from isac_rt.extensions.cooperation.fusion import (
+    FusedTracks,
+    Report,
+    Reported,
+    advance,
+    at_once,
+    report_of,
+)
 from isac_rt.plain import Stateful
 from isac_rt.track.filter import Gaussian
 from isac_rt.track.fused import Fused, Key, Name
@@ -33,12 +40,12 @@ REPORT_BITS = 8 + 16 + 16 + 40 + 120 + 6 * 16 + 15 * 8 + 8
 """A track: whose, number, age, name, mean (24 bits of each position, 16 of each velocity),
 deviations and correlations, and how far the clock moves it; what the errors of the pose do follows
 from the terminal's own place. What these bits round off is not modelled: a centimetre and less."""
-LOOK_BITS = 16 + 16 + 3 * 24 + 3 * 16 + 3 * 16 + 8
+SCAN_BITS = 16 + 16 + 3 * 24 + 3 * 16 + 3 * 16 + 8
 """Of one frame of a link: which, when, the receiver's position, velocity and attitude, how well its
 clock is known."""
 DETECTION_BITS = 24 + 16 + 2 * 14 + 4 * 8 + 8 + 16 + 1 + 40
 """Range, rate, two cosines, their deviations, level, number of its track and whether that is
-confirmed, name of the body."""
+confirmed, name of the UAV."""
 CODE_RATE = 0.5
 """Share of an active terminal's bits that messages get; the rest protects them."""
 CORRECTED = 0.05
@@ -59,7 +66,7 @@ class Kept:
 
 
 @dataclass(frozen=True)
-class Said:
+class SelfReport:
     """Position and velocity (6,) that a terminal reported of itself at a time [s]."""
 
     time: float
@@ -77,15 +84,15 @@ class Message:
     terminals : what it knows that terminals said of themselves, itself included
     kept : by link
     reports : of tracks, its own and others'
-    looks : detections, its own and others'
+    scans : detections, its own and others'
     left_out : tracks or detections that were new and that it had no room for
     """
 
     sender: str
-    terminals: Mapping[str, Said]
+    terminals: Mapping[str, SelfReport]
     kept: Mapping[str, Kept]
     reports: Sequence[Report]
-    looks: Sequence[Look] = ()
+    scans: Sequence[Scan] = ()
     left_out: int = 0
 
     @property
@@ -97,7 +104,7 @@ class Message:
             + TERMINAL_BITS * len(self.terminals)
             + NUMBER_BITS * numbers
             + REPORT_BITS * len(self.reports)
-            + sum(_bits(look, len(look)) for look in self.looks)
+            + sum(_bits(scan, len(scan)) for scan in self.scans)
         )
 
 
@@ -158,18 +165,18 @@ class Notes(Stateful):
     reports : the latest of every track, and by whom each was said ("": its own)
     kept : by link the tracks that its receiver keeps
     terminals : what they said of themselves
-    told : by listener the time of each track's report that went there last [s]
-    picture : what it makes of all this
+    reported_to : by listener the time of each track's report that went there last [s]
+    fused_tracks : what it makes of all this
     """
 
     name: str
     reports: dict[Key, tuple[Report, str]] = field(default_factory=dict)
     kept: dict[str, Kept] = field(default_factory=dict)
-    terminals: dict[str, Said] = field(default_factory=dict)
-    told: dict[str, dict[Key, float]] = field(default_factory=dict)
-    picture: Picture = field(default_factory=Picture)
+    terminals: dict[str, SelfReport] = field(default_factory=dict)
+    reported_to: dict[str, dict[Key, float]] = field(default_factory=dict)
+    fused_tracks: FusedTracks = field(default_factory=FusedTracks)
 
-    def see(self, origin: str, time: float, tracks: Mapping[int, Told]) -> None:
+    def see(self, origin: str, time: float, tracks: Mapping[int, Reported]) -> None:
         """Take down the tracks of one of its own links after a frame, by their numbers; tracks that
         were there before have begun before."""
         mine = [key for key in self.reports if key.origin == origin]
@@ -183,14 +190,14 @@ class Notes(Stateful):
 
     def stand(self, time: float, state: Gaussian) -> None:
         """Take down where it is itself."""
-        self.terminals[self.name] = Said(time, state)
+        self.terminals[self.name] = SelfReport(time, state)
 
-    def hear(self, message: Message) -> None:
+    def receive(self, message: Message) -> None:
         """Take down what is newer than what it knows."""
         sender = message.sender
-        for name, said in message.terminals.items():
-            if name != self.name and self._newer(said.time, self.terminals.get(name)):
-                self.terminals[name] = replace(said, via=sender)
+        for name, report_ in message.terminals.items():
+            if name != self.name and self._newer(report_.time, self.terminals.get(name)):
+                self.terminals[name] = replace(report_, via=sender)
         for origin, kept in message.kept.items():
             if self._newer(kept.time, self.kept.get(origin)):
                 self.kept[origin] = replace(kept, via=sender)
@@ -200,26 +207,26 @@ class Notes(Stateful):
                 self.reports[report.key] = report, sender
 
     @staticmethod
-    def _newer(time: float, known: Said | Kept | Report | None) -> bool:
+    def _newer(time: float, known: SelfReport | Kept | Report | None) -> bool:
         return known is None or time > known.time
 
-    def look(self, time: float, acceleration_std: float) -> list[Fused]:
-        """Its picture at a time [s], after forgetting what has ended or was not said for
-        `HOLD_S`."""
+    def fuse(self, time: float, acceleration_std: float) -> list[Fused]:
+        """Return the fused tracks at a time [s], after forgetting what has ended or was not said
+        for `HOLD_S`."""
         self.reports = {k: r for k, r in self.reports.items() if self._counts(r[0], time)}
         self.terminals = {k: s for k, s in self.terminals.items() if time - s.time <= HOLD_S}
-        fused = self.picture.update(
+        fused = self.fused_tracks.update(
             at_once((report for report, _ in self.reports.values()), time, acceleration_std),
             {
-                name: its_word(said.state).after(time - said.time, acceleration_std)
-                for name, said in self.terminals.items()
+                name: report_of(report_.state).after(time - report_.time, acceleration_std)
+                for name, report_ in self.terminals.items()
             },
         )
-        for body in fused:
-            for key in body.members:
+        for uav in fused:
+            for key in uav.members:
                 report, via = self.reports[key]
-                if report.name != body.name:
-                    self.reports[key] = replace(report, name=body.name), via
+                if report.name != uav.name:
+                    self.reports[key] = replace(report, name=uav.name), via
         return fused
 
     def _counts(self, report: Report, time: float) -> bool:
@@ -233,7 +240,7 @@ class Notes(Stateful):
         """Compose the message to a listener over a channel of `capacity` bits a frame: nothing that
         came from there, and first the tracks that were not reported for longest. One frame's fill,
         but one track at least."""
-        told = self.told.setdefault(listener, {})
+        reported_to = self.reported_to.setdefault(listener, {})
         bare = Message(
             self.name,
             {k: s for k, s in self.terminals.items() if listener not in (k, s.via)},
@@ -243,12 +250,12 @@ class Notes(Stateful):
         new = [
             report
             for report, via in self.reports.values()
-            if via != listener and report.time > told.get(report.key, -1.0)
+            if via != listener and report.time > reported_to.get(report.key, -1.0)
         ]
-        new.sort(key=lambda report: (told.get(report.key, -1.0), report.key))
-        room = ceil(bare.bits / capacity) * capacity - bare.bits
-        chosen = new[: max(1, room // REPORT_BITS)]
-        told |= {report.key: report.time for report in chosen}
+        new.sort(key=lambda report: (reported_to.get(report.key, -1.0), report.key))
+        capacity_left = ceil(bare.bits / capacity) * capacity - bare.bits
+        chosen = new[: max(1, capacity_left // REPORT_BITS)]
+        reported_to |= {report.key: report.time for report in chosen}
         return replace(bare, reports=chosen, left_out=len(new) - len(chosen))
 
     def ages(self, time: float) -> tuple[float, ...]:
@@ -263,13 +270,13 @@ class Noted:
     Attributes
     ----------
     terminals : what they said of themselves
-    looks : by time and link, and by whom each was said ("": its own)
-    told : by listener what went there
+    scans : by time and link, and by whom each was said ("": its own)
+    reported_to : by listener what went there
     """
 
-    terminals: dict[str, Said] = field(default_factory=dict)
-    looks: dict[tuple[float, str], tuple[Look, str]] = field(default_factory=dict)
-    told: dict[str, set[tuple[float, str]]] = field(default_factory=dict)
+    terminals: dict[str, SelfReport] = field(default_factory=dict)
+    scans: dict[tuple[float, str], tuple[Scan, str]] = field(default_factory=dict)
+    reported_to: dict[str, set[tuple[float, str]]] = field(default_factory=dict)
 
 
 class Sightings(Stateful):
@@ -281,7 +288,7 @@ class Sightings(Stateful):
     tracker : what it makes of all detections
     """
 
-    def __init__(self, name: str, tracker: PooledTracker) -> None:
+    def __init__(self, name: str, tracker: CentralisedTracker) -> None:
         self.name, self.tracker = name, tracker
         self.state = Noted()
 
@@ -290,58 +297,58 @@ class Sightings(Stateful):
         return {"tracker": self.tracker}
 
     @property
-    def terminals(self) -> dict[str, Said]:
+    def terminals(self) -> dict[str, SelfReport]:
         """Return what terminals reported of themselves."""
         return self.state.terminals
 
     def stand(self, time: float, state: Gaussian) -> None:
         """Take down where it is itself."""
-        self.terminals[self.name] = Said(time, state)
+        self.terminals[self.name] = SelfReport(time, state)
 
-    def see(self, look: Look) -> None:
+    def see(self, scan: Scan) -> None:
         """Take down the detections of one of its own links after a frame."""
-        self._take(look, "")
-        kept, via = self.state.looks[look.key]
-        self.state.looks[look.key] = replace(kept, names=self.tracker.names_of(kept)), via
+        self._take(scan, "")
+        kept, via = self.state.scans[scan.key]
+        self.state.scans[scan.key] = replace(kept, names=self.tracker.names_of(kept)), via
 
-    def hear(self, message: Message) -> None:
+    def receive(self, message: Message) -> None:
         """Take down what it does not know yet."""
-        for name, said in message.terminals.items():
+        for name, report_ in message.terminals.items():
             known = self.terminals.get(name)
-            if name != self.name and (known is None or said.time > known.time):
-                self.terminals[name] = replace(said, via=message.sender)
-        for look in message.looks:
-            if look.key not in self.state.looks:
-                self._take(look, message.sender)
+            if name != self.name and (known is None or report_.time > known.time):
+                self.terminals[name] = replace(report_, via=message.sender)
+        for scan in message.scans:
+            if scan.key not in self.state.scans:
+                self._take(scan, message.sender)
 
-    def _take(self, look: Look, via: str) -> None:
-        """A look whose transmitter is not known at all says nothing of places."""
-        self.state.looks[look.key] = look, via
-        tx, rx = look.ends
+    def _take(self, scan: Scan, via: str) -> None:
+        """A scan whose transmitter is not known at all says nothing of places."""
+        self.state.scans[scan.key] = scan, via
+        tx, rx = scan.ends
         if tx == rx:
-            self.tracker.add(look, None)
+            self.tracker.add(scan, None)
         elif tx in self.terminals:
-            said = self.terminals[tx]
-            self.tracker.add(look, _moved(said.state.mean, look.time - said.time))
+            report_ = self.terminals[tx]
+            self.tracker.add(scan, _moved(report_.state.mean, scan.time - report_.time))
 
-    def look(self, time: float, acceleration_std: float) -> list[Fused]:
-        """Its picture at a time [s], after forgetting what was not said for `HOLD_S`."""
-        self.state.looks = {k: v for k, v in self.state.looks.items() if time - k[0] <= HOLD_S}
+    def fuse(self, time: float, acceleration_std: float) -> list[Fused]:
+        """Return the fused tracks at a time [s], without what was not said for `HOLD_S`."""
+        self.state.scans = {k: v for k, v in self.state.scans.items() if time - k[0] <= HOLD_S}
         self.state.terminals = {k: s for k, s in self.terminals.items() if time - s.time <= HOLD_S}
         self.tracker.forget(time)
         known = {
-            name: advance(said.state, time - said.time, acceleration_std)
-            for name, said in self.terminals.items()
+            name: advance(report_.state, time - report_.time, acceleration_std)
+            for name, report_ in self.terminals.items()
         }
         return self.tracker.at(time, known)
 
     def ages(self, time: float) -> tuple[float, ...]:
         """Return the ages of the detections that others reported and are still valid [s]."""
         return tuple(
-            time - look.time
-            for look, via in self.state.looks.values()
+            time - scan.time
+            for scan, via in self.state.scans.values()
             if via
-            for _ in range(len(look))
+            for _ in range(len(scan))
         )
 
     def compose(self, listener: str, capacity: int) -> Message:
@@ -350,30 +357,32 @@ class Sightings(Stateful):
         others. What does not fit is not sent later; one detection is sent at least."""
         terminals = {k: s for k, s in self.terminals.items() if listener not in (k, s.via)}
         bare = Message(self.name, terminals, {}, [])
-        told = self.state.told.setdefault(listener, set())
+        reported_to = self.state.reported_to.setdefault(listener, set())
         new = [
-            look
-            for key, (look, via) in self.state.looks.items()
-            if listener not in (via, look.ends[1]) and key not in told
+            scan
+            for key, (scan, via) in self.state.scans.items()
+            if listener not in (via, scan.ends[1]) and key not in reported_to
         ]
-        new.sort(key=lambda look: (-look.time, look.origin))
+        new.sort(key=lambda scan: (-scan.time, scan.origin))
         least = bare.bits + (_bits(new[0], min(1, len(new[0]))) if new else 0)
-        room = ceil(least / capacity) * capacity - bare.bits
+        capacity_left = ceil(least / capacity) * capacity - bare.bits
         chosen, left = [], sum(map(len, new))
-        for look in new:
-            count = min(len(look), (room - _bits(look, 0)) // DETECTION_BITS)
-            if count < min(1, len(look)):
+        for scan in new:
+            count = min(len(scan), (capacity_left - _bits(scan, 0)) // DETECTION_BITS)
+            if count < min(1, len(scan)):
                 break
-            chosen.append(look.select(look.best(count)))
-            room -= _bits(look, count)
+            chosen.append(scan.select(scan.best(count)))
+            capacity_left -= _bits(scan, count)
             left -= count
-        self.state.told[listener] = (told | {look.key for look in new}) & self.state.looks.keys()
-        return replace(bare, looks=chosen, left_out=left)
+        self.state.reported_to[listener] = (
+            reported_to | {scan.key for scan in new}
+        ) & self.state.scans.keys()
+        return replace(bare, scans=chosen, left_out=left)
 
 
-def _bits(look: Look, detections: int) -> int:
+def _bits(scan: Scan, detections: int) -> int:
     """Count the bits of a dwell with a number of its detections."""
-    return LOOK_BITS + NUMBER_BITS * len(look.kept) + DETECTION_BITS * detections
+    return SCAN_BITS + NUMBER_BITS * len(scan.kept) + DETECTION_BITS * detections
 
 
 def _moved(state: np.ndarray, interval: float) -> np.ndarray:

@@ -1,5 +1,5 @@
-"""The swarm talks: after every frame terminals take down their tracks, hear what the links carried,
-and send the next."""
+"""The swarm talks: after every frame terminals take down their tracks, receive what the links
+carried, and send the next."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from isac_rt.extensions.cooperation.fusion import Picture, advance, at_once, in_world, its_word
+from isac_rt.extensions.cooperation.centralised import CentralisedTracker, Scan, TrackManagement
+from isac_rt.extensions.cooperation.fusion import FusedTracks, advance, at_once, in_world, report_of
 from isac_rt.extensions.cooperation.messages import CODE_RATE, CORRECTED, Channel, Notes, Sightings
-from isac_rt.extensions.cooperation.pool import Lives, Look, PooledTracker
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.plain import Stateful
 from isac_rt.results.metrics import SymbolCount
 from isac_rt.results.records import LateRecord
-from isac_rt.results.scoring import Heard
+from isac_rt.results.scoring import LinkResult
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
 from isac_rt.simulation.stations import PREFETCHED_FRAMES
 from isac_rt.track.filter import Ambiguity
 from isac_rt.track.fused import Fused
-from isac_rt.track.parts import KnownBody, of_itself
+from isac_rt.track.parts import ReportedUav, of_itself
 from isac_rt.track.reference import TerminalState
 from isac_rt.track.tracker import in_plane
 from isac_rt.world.swarm import Pose
@@ -35,11 +35,11 @@ class Talk:
     Attributes
     ----------
     channels : by way
-    known : by frame its time [s], and by terminal the bodies that it knew of then
+    known : by frame its time [s], and by terminal the UAVs that it knew of then
     """
 
     channels: dict[Link, Channel] = field(default_factory=dict)
-    known: dict[int, tuple[float, dict[str, list[KnownBody]]]] = field(default_factory=dict)
+    known: dict[int, tuple[float, dict[str, list[ReportedUav]]]] = field(default_factory=dict)
 
 
 class Cooperation(Stateful):
@@ -50,12 +50,14 @@ class Cooperation(Stateful):
         links = setup.timetable.all_links
         self._names = list(dict.fromkeys(link.rx for link in links))
         s = setup.scenario
-        self._pools = s.cooperation == "detections"
+        self._centralised = s.cooperation == "detections"
         self._notes: dict[str, Notes | Sightings] = {
-            name: Sightings(name, self._pool()) if self._pools else Notes(name)
+            name: Sightings(name, self._tracker()) if self._centralised else Notes(name)
             for name in self._names
         }
-        self._swarm: Picture | PooledTracker = self._pool() if self._pools else Picture()
+        self._swarm: FusedTracks | CentralisedTracker = (
+            self._tracker() if self._centralised else FusedTracks()
+        )
         self.state = Talk()
         self._acceleration = s.tracking.acceleration_std_mps2
         self._feedback = int(s.access.feedback_rate_bps * setup.timetable.interval)
@@ -66,44 +68,46 @@ class Cooperation(Stateful):
             "swarm": self._swarm
         }
 
-    def _pool(self) -> PooledTracker:
+    def _tracker(self) -> CentralisedTracker:
         """A tracker of all terminals' detections."""
         setup, w = self._setup, self._setup.waveform
         s = setup.scenario
         period = s.receivers.active_every_frames * setup.timetable.interval
         ambiguities = Ambiguity.of(w, 2), Ambiguity.of(w, 1)
         names = dict.fromkeys([*self._names, *(link.tx for link in setup.timetable.all_links)])
-        return PooledTracker([*names], s.tracking, Lives.of(s.tracking, period), ambiguities)
+        return CentralisedTracker(
+            [*names], s.tracking, TrackManagement.of(s.tracking, period), ambiguities
+        )
 
     def step(
         self,
         frame: int,
-        heard: Mapping[Link, Heard],
+        received: Mapping[Link, LinkResult],
         symbols: Mapping[Link, SymbolCount],
         late: Mapping[Link, Sequence[LateRecord]],
     ) -> dict[str, View]:
-        """The pictures after a frame, by terminal, and under `SWARM` what all of them know
-        together, as if links took no time and lost nothing.
+        """The set of fused tracks after a frame, by terminal, and under `SWARM` what all of them
+        know together, as if links took no time and lost nothing.
 
         Parameters
         ----------
-        heard : what the links' receivers made of the frame
+        received : what the links' receivers made of the frame
         symbols : what was sent to them and became of it; their checksums say as much
         late : earlier frames that they read only now
         """
         timetable = self._setup.timetable
         time = max(timetable.epoch(frame, tx) for tx in timetable.with_role("active", frame))
-        traffic = self._carry(frame, heard, symbols)
+        traffic = self._carry(frame, received, symbols)
         self._carry_late(late, traffic)
         poses = {n: self._setup.believed(p) for n, p in self._setup.swarm.poses(time).items()}
         for name, notes in self._notes.items():
             notes.stand(time, of_itself(poses[name]))
-        for link, result in heard.items():
+        for link, result in received.items():
             self._see(frame, link, result)
         views = {
             name: View(
                 time,
-                tuple(notes.look(time, self._acceleration)),
+                tuple(notes.fuse(time, self._acceleration)),
                 notes.ages(time),
                 traffic[name],
             )
@@ -113,34 +117,37 @@ class Cooperation(Stateful):
         self.state.known = {
             k: v for k, v in self.state.known.items() if k > frame - PREFETCHED_FRAMES
         }
-        self.state.known[frame] = time, {n: self._bodies(n, views[n], time) for n in self._notes}
+        self.state.known[frame] = (
+            time,
+            {n: self._reported_uavs(n, views[n], time) for n in self._notes},
+        )
         self._send(frame)
         return {**views, SWARM: View(time, tuple(together))}
 
-    def _bodies(self, name: str, view: View, time: float) -> list[KnownBody]:
+    def _reported_uavs(self, name: str, view: View, time: float) -> list[ReportedUav]:
         """Return the targets that a terminal knows of: other terminals by their reports, and the
         fused tracks that are none of these."""
-        said = self._notes[name].terminals
-        mates = [
-            KnownBody(other, advance(s.state, time - s.time, self._acceleration))
-            for other, s in said.items()
+        report_ = self._notes[name].terminals
+        reported_poses = [
+            ReportedUav(other, advance(s.state, time - s.time, self._acceleration))
+            for other, s in report_.items()
         ]
-        return mates + [KnownBody("", b.state) for b in view.bodies if b.terminal is None]
+        return reported_poses + [ReportedUav("", b.state) for b in view.fused if b.terminal is None]
 
-    def told(self, link: Link, frame: int, time: float) -> list[KnownBody]:
-        """The bodies that a link's receiver knew of after a frame, at a time [s], but the link's
+    def reports(self, link: Link, frame: int, time: float) -> list[ReportedUav]:
+        """The UAVs that a link's receiver knew of after a frame, at a time [s], but the link's
         ends; none where the frame is not remembered."""
         then, known = self.state.known.get(frame, (time, {}))
         return [
-            body._replace(state=advance(body.state, time - then, self._acceleration))
-            for body in known.get(link.rx, [])
-            if body.terminal not in link
+            uav._replace(state=advance(uav.state, time - then, self._acceleration))
+            for uav in known.get(link.rx, [])
+            if uav.terminal not in link
         ]
 
     def _together(self, time: float, poses: Mapping[str, Pose]) -> list[Fused]:
         """Return what all terminals know together at a time [s]."""
         known = {name: of_itself(poses[name]) for name in self._notes}
-        if isinstance(self._swarm, PooledTracker):
+        if isinstance(self._swarm, CentralisedTracker):
             self._swarm.forget(time)
             return self._swarm.at(time, known)
         own = [
@@ -150,13 +157,13 @@ class Cooperation(Stateful):
             for report, via in notes.reports.values()
             if not via
         ]
-        words = {name: its_word(said) for name, said in known.items()}
+        words = {name: report_of(report_) for name, report_ in known.items()}
         return self._swarm.update(at_once(own, time, self._acceleration), words)
 
-    def _see(self, frame: int, link: Link, heard: Heard) -> None:
+    def _see(self, frame: int, link: Link, received: LinkResult) -> None:
         """A terminal takes down what one of its links shows: its confirmed tracks, or what its
         tracks rest on."""
-        setup, tracks = self._setup, heard.tracks
+        setup, tracks = self._setup, received.tracks
         time = setup.timetable.epoch(frame, link.tx)
         own = setup.believed(setup.swarm.trajectories[link.rx].pose(time))
         clock = 0.0
@@ -164,19 +171,21 @@ class Cooperation(Stateful):
             clock = SPEED_OF_LIGHT * setup.connections.offset_std(link, time)
         notes = self._notes[link.rx]
         if isinstance(notes, Notes):
-            told = (tracks.confirmed & ~tracks.is_reference).nonzero()[0]
+            reported_to = (tracks.confirmed & ~tracks.is_reference).nonzero()[0]
             cell = setup.waveform.range_cell(1)
-            states = {int(tracks.ids[k]): in_world(tracks, int(k), own, clock, cell) for k in told}
+            states = {
+                int(tracks.ids[k]): in_world(tracks, int(k), own, clock, cell) for k in reported_to
+            }
             notes.see(str(link), time, states)
             return
-        look = look_of(link, frame, time, own, heard, clock)
-        notes.see(look)
-        if isinstance(self._swarm, PooledTracker):
+        scan = scan_of(link, frame, time, own, received, clock)
+        notes.see(scan)
+        if isinstance(self._swarm, CentralisedTracker):
             sender = setup.believed(setup.swarm.trajectories[link.tx].pose(time))
             at = None if link.own else np.concatenate([sender.position, sender.velocity])
-            self._swarm.add(look, at)
+            self._swarm.add(scan, at)
 
-    def _ways(self, frame: int) -> dict[Link, int]:
+    def _capacities(self, frame: int) -> dict[Link, int]:
         """Bits that each way from terminal to terminal has for messages in a frame: an active
         terminal's data frames, and a passive one's feedback."""
         timetable, out = self._setup.timetable, {}
@@ -193,49 +202,51 @@ class Cooperation(Stateful):
         return out
 
     def _carry(
-        self, frame: int, heard: Mapping[Link, Heard], symbols: Mapping[Link, SymbolCount]
+        self, frame: int, received: Mapping[Link, LinkResult], symbols: Mapping[Link, SymbolCount]
     ) -> dict[str, Traffic]:
         """Let a frame pass over all channels; how many messages came to each terminal, and how many
         were lost."""
         came = dict.fromkeys(self._notes, Traffic())
-        for way, capacity in self._ways(frame).items():
-            channel = self.state.channels.setdefault(way, Channel())
-            if way in heard:
-                read = heard[way].reception.decoded and _corrected(symbols[way])
+        for direction, capacity in self._capacities(frame).items():
+            channel = self.state.channels.setdefault(direction, Channel())
+            if direction in received:
+                read = received[direction].reception.decoded and _corrected(symbols[direction])
             else:
-                read = heard[Link(way.rx, way.tx)].state == TerminalState.TRACKING
-            came[way.rx] += Traffic(room=capacity)
+                read = received[Link(direction.rx, direction.tx)].state == TerminalState.TRACKING
+            came[direction.rx] += Traffic(room=capacity)
             done = channel.carry(frame, capacity, read)
             if done is not None:
                 message, arrived = done
-                came[way.rx] += Traffic(
+                came[direction.rx] += Traffic(
                     1, not arrived, bits=message.bits, left_out=message.left_out
                 )
                 if arrived:
-                    self._notes[way.rx].hear(message)
+                    self._notes[direction.rx].receive(message)
         return came
 
     def _carry_late(
         self, late: Mapping[Link, Sequence[LateRecord]], came: dict[str, Traffic]
     ) -> None:
         """Add to `came` what arrives with frames that were read late."""
-        for way, records in late.items():
+        for direction, records in late.items():
             for one in records:
-                if way in self.state.channels and _corrected(one.symbols):
-                    for message in self.state.channels[way].late(one.frame):
-                        came[way.rx] += Traffic(late=1)
-                        self._notes[way.rx].hear(message)
+                if direction in self.state.channels and _corrected(one.symbols):
+                    for message in self.state.channels[direction].late(one.frame):
+                        came[direction.rx] += Traffic(late=1)
+                        self._notes[direction.rx].receive(message)
 
     def _send(self, frame: int) -> None:
         """Put new messages on the channels that are free; channels between terminals that have no
         link any more are closed."""
         if frame + 1 >= self._setup.timetable.frames:
             return
-        ways = self._ways(frame + 1)
-        self.state.channels = {way: self.state.channels.get(way, Channel()) for way in ways}
-        for way, channel in self.state.channels.items():
-            if channel.message is None and ways[way] > 0:
-                channel.send(self._notes[way.tx].compose(way.rx, ways[way]))
+        ways = self._capacities(frame + 1)
+        self.state.channels = {
+            direction: self.state.channels.get(direction, Channel()) for direction in ways
+        }
+        for direction, channel in self.state.channels.items():
+            if channel.message is None and ways[direction] > 0:
+                channel.send(self._notes[direction.tx].compose(direction.rx, ways[direction]))
 
 
 def _corrected(count: SymbolCount) -> bool:
@@ -243,7 +254,9 @@ def _corrected(count: SymbolCount) -> bool:
     return count.bit_errors <= CORRECTED * count.bits_total
 
 
-def look_of(link: Link, frame: int, time: float, own: Pose, heard: Heard, clock_std: float) -> Look:
+def scan_of(
+    link: Link, frame: int, time: float, own: Pose, received: LinkResult, clock_std: float
+) -> Scan:
     """The detections of a frame that a receiver's tracks took. The reference's is left out.
 
     Parameters
@@ -252,11 +265,11 @@ def look_of(link: Link, frame: int, time: float, own: Pose, heard: Heard, clock_
     own : the receiver's pose as it believes it
     clock_std : deviation of its ranges by its clock [m]
     """
-    tracks, found = heard.tracks, in_plane(heard.reception.detections)
+    tracks, found = received.tracks, in_plane(received.reception.detections)
     straight = ~tracks.is_reference
     mine = (tracks.detection >= 0) & straight
     rows = tracks.detection[mine]
-    return Look(
+    return Scan(
         str(link),
         frame,
         time,

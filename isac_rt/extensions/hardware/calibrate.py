@@ -134,7 +134,7 @@ def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Ca
     Raises
     ------
     CaptureError  If no reflector is clear, with its rank-one share and level; if a channel does not
-        hear it.
+        receive it.
     """
     y, w = capture.channels(), capture.cube.waveform
     if min(y.shape[:2]) < 2:

@@ -32,7 +32,7 @@ from isac_rt.frame.cube import IFCube, ReceiveArray, Reference
 from isac_rt.frame.schedule import codes_of
 from isac_rt.frame.waveform import Sweep, Waveform
 from isac_rt.kernels.signal_direct import add_direct
-from isac_rt.signal.if_signal import heard
+from isac_rt.signal.if_signal import received_tones
 from isac_rt.signal.methods import Method
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.signal.tones import Links, Tones
@@ -63,7 +63,7 @@ def received(
     ends : the hardware, its senders in the order of the links
     noise : at the receiver's input
     """
-    schedule, tones = heard(waveform, links, receiver, reference)
+    schedule, tones = received_tones(waveform, links, receiver, reference)
     tones = _with_elements(tones, waveform, links, receiver, ends)
     delays = np.concatenate([s.delay for _, s in links] or [np.zeros(0)])
     turns, read = _turns(waveform, tones, ends), _read(waveform, tones, ends)

@@ -46,15 +46,20 @@ from isac_rt.kernels import propagation_field
 from isac_rt.kernels.jit import twin_of
 from isac_rt.plain import plain
 from isac_rt.propagation.clutter.cells import MOST_CELLS, Cells, Density, cut, error_for
-from isac_rt.propagation.clutter.merging import Heard, NoiseFloor, covered, resolution_cell
+from isac_rt.propagation.clutter.merging import (
+    NoiseFloor,
+    VisibleCells,
+    merged_below_noise,
+    resolution_cell,
+)
 from isac_rt.propagation.clutter.overlaps import lies_twice
 from isac_rt.propagation.clutter.penumbra import Facets
-from isac_rt.propagation.clutter.sight import KNOT_SPACING, Flight, Sight, ever_ahead
-from isac_rt.propagation.legs.bodies import Bodies
+from isac_rt.propagation.clutter.visibility import SAMPLE_SPACING, Flight, Visibility, ever_ahead
+from isac_rt.propagation.legs.discs import UavDiscs
 from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.legs.reflection import slab_coefficients
 from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.propagation.ways import LinkState, Ways
+from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
 from isac_rt.storage import kept
 from isac_rt.world.city.materials import Material
 from isac_rt.world.city.mesh import CityMesh
@@ -91,7 +96,7 @@ class Surfaces(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Seen(Ways):
+class Seen(ScatterPaths):
     """K scatterers of the field between two terminals at one instant, isotropic antennas.
 
     Float32 where that is enough (magnitude, acceleration); what both ends of a terminal's own link
@@ -204,7 +209,7 @@ class Scatterers(NamedTuple):
     """Scatterers that a link sees, and from where."""
 
     cells: Cells
-    sight: Sight
+    sight: Visibility
 
 
 class ClutterField:
@@ -217,7 +222,7 @@ class ClutterField:
         self,
         city: CityMesh,
         cells: Cells,
-        sight: Sight,
+        sight: Visibility,
         wavelength: float,
         num_candidates: int,
         overlap: float,
@@ -245,13 +250,13 @@ class ClutterField:
         floor: NoiseFloor | None = None,
     ) -> ClutterField:
         """Cut the surfaces for the whole run's flights, and keep what any transmitter sees from any
-        place of its flight. Where there is a `floor`, leave out what no element sends or hears, and
-        merge what the noise of each link covers."""
+        place of its flight. Where there is a `floor`, leave out what no element sends or receives,
+        and merge what the noise of each link covers."""
         flights = {
             name: Flight(swarm.trajectories[name], swarm.duration, city.origin)
             for name in swarm.terminals
         }
-        places = np.concatenate([flight.knots for flight in flights.values()])
+        places = np.concatenate([flight.time_samples for flight in flights.values()])
         scatters = np.array([m.scattering_coefficient > 0 for m in city.materials], bool)[
             city.face_material
         ]
@@ -278,7 +283,7 @@ class ClutterField:
         depends_on = [plain(city), places, lookouts, fronts, asdict(density), seed, MOST_CELLS]
         had = kept("cells", [*depends_on, mi.variant()], found)
         cells = Cells(**had["cells"])
-        sight = Sight(shadows, flights, facets_of(cells, city), wavelength, city)
+        sight = Visibility(shadows, flights, facets_of(cells, city), wavelength, city)
         field = cls(city, cells, sight, wavelength, had["of"], had["overlap"])
         if floor is None:
             return field
@@ -291,7 +296,7 @@ class ClutterField:
         merged = kept(
             "merged",
             [*depends_on, mi.variant()],
-            lambda: field._covered(floor, poses, density, places),
+            lambda: field._below_noise(floor, poses, density, places),
         )
         return field._with(
             {link: field._own(link, Cells(**merged[str(link)])) for link in floor.over_noise}
@@ -313,10 +318,10 @@ class ClutterField:
         """Cells that a link alone sees."""
         flights = {name: self.sight.flights[name] for name in link}
         facets = facets_of(cells, self._city)
-        sight = Sight(self.sight.shadows, flights, facets, self._wavelength, self._city)
+        sight = Visibility(self.sight.shadows, flights, facets, self._wavelength, self._city)
         return Scatterers(cells, sight)
 
-    def _covered(
+    def _below_noise(
         self,
         floor: NoiseFloor,
         poses: dict[str, list[Pose]],
@@ -342,26 +347,30 @@ class ClutterField:
             if not floor.antennas.look_back:
                 held &= ever_ahead(sight.flights[link.rx].fronts, cells.points)
             both = np.flatnonzero(held)
-            some, heard = cells.select(both), []
+            some, visible = cells.select(both), []
             for k in np.flatnonzero(over_noise):
                 state = LinkState(link, floor.times[k], poses[link.tx][k], poses[link.rx][k])
                 share = (seen[link.tx][k] & seen[link.rx][k])[both].astype(np.float32)
-                heard.append(self._heard(floor, some, share, state, over_noise[k]))
-            merged[str(link)] = vars(covered(some, heard, finest[both], error))
+                visible.append(self._visible(floor, some, share, state, over_noise[k]))
+            merged[str(link)] = vars(merged_below_noise(some, visible, finest[both], error))
         return merged
 
-    def _heard(
+    def _visible(
         self, floor: NoiseFloor, cells: Cells, share: np.ndarray, state: LinkState, level: float
-    ) -> Heard:
+    ) -> VisibleCells:
         """Return a link's paths over cells that both ends see by shares (N,); `level` is the power
         of a path over the noise, per power gain."""
-        ways = self._ways(cells, share, state)
-        power = level * (ways.magnitude * state.elements(floor.antennas, ways)) ** 2
-        delay = ways.length / SPEED_OF_LIGHT
+        scatter_paths = self._ways(cells, share, state)
+        power = (
+            level * (scatter_paths.magnitude * state.elements(floor.antennas, scatter_paths)) ** 2
+        )
+        delay = scatter_paths.length / SPEED_OF_LIGHT
         some = (power > 0) & (delay < floor.longest_delay)
-        rate = ways.rate[some] / SPEED_OF_LIGHT
-        return Heard(
-            ways.index[some], power[some], resolution_cell(floor.waveform, delay[some], rate)
+        rate = scatter_paths.rate[some] / SPEED_OF_LIGHT
+        return VisibleCells(
+            scatter_paths.index[some],
+            power[some],
+            resolution_cell(floor.waveform, delay[some], rate),
         )
 
     @property
@@ -372,23 +381,23 @@ class ClutterField:
             sight.nbytes for _, sight in every
         )
 
-    def seen(self, state: LinkState, bodies: Bodies | None = None) -> Seen:
+    def seen(self, state: LinkState, discs: UavDiscs | None = None) -> Seen:
         """Return the scatterers in sight of both ends of a link, poses in local coordinates; in the
-        shadows of `bodies`, if given."""
+        shadows of `discs`, if given."""
         (tx, rx), own, start, end = state.link, state.link.own, state.start, state.end
         cells, sight = self.of(state.link)
         share = sight.share(tx, start, state.epoch)
         if not own:
             share = share * sight.share(rx, end, state.epoch)
         found = self._ways(cells, share, state)
-        if bodies is not None:
+        if discs is not None:
             points = cells.points.take(found.index, axis=0)
-            sent, heard = (bodies.spared([(name,)]) for name in (tx, rx))
-            there = bodies.sight(start.position, points, found.tx_radius, self._wavelength, sent)
+            sent, visible = (discs.spared([(name,)]) for name in (tx, rx))
+            there = discs.sight(start.position, points, found.tx_radius, self._wavelength, sent)
             back = (
                 there
                 if own
-                else bodies.sight(end.position, points, found.rx_radius, self._wavelength, heard)
+                else discs.sight(end.position, points, found.rx_radius, self._wavelength, visible)
             )
             found.magnitude[:] *= there * back
         lit = np.flatnonzero(found.magnitude)
@@ -426,9 +435,9 @@ class ClutterField:
         advance(self.surfaces, c.points, c.face, c.area, share, self._scale, *motion, own, rows)
         return found
 
-    def paths(self, state: LinkState, antennas: Antennas, bodies: Bodies | None = None) -> PathSet:
-        """The link's paths; poses, points and bodies in local coordinates."""
-        seen, cells = self.seen(state, bodies), self.of(state.link).cells
+    def paths(self, state: LinkState, antennas: Antennas, discs: UavDiscs | None = None) -> PathSet:
+        """The link's paths; poses, points and UAVs in local coordinates."""
+        seen, cells = self.seen(state, discs), self.of(state.link).cells
         return state.paths(
             seen,
             cells.amplitude[seen.index] * (seen.magnitude * state.elements(antennas, seen)),
@@ -451,8 +460,10 @@ def in_local(pose: Pose, origin: np.ndarray) -> Pose:
 
 def _kept_places(flights: Sequence[Flight]) -> np.ndarray:
     """(K, 3) places of the flights from which cells are tested."""
-    step = round(KEPT_SPACING / KNOT_SPACING)
-    return np.concatenate([part for f in flights for part in (f.knots[::step], f.knots[-1:])])
+    step = round(KEPT_SPACING / SAMPLE_SPACING)
+    return np.concatenate(
+        [part for f in flights for part in (f.time_samples[::step], f.time_samples[-1:])]
+    )
 
 
 def surfaces(city: CityMesh, wavelength: float) -> Surfaces:

@@ -56,7 +56,7 @@ class NoiseFloor:
     Attributes
     ----------
     waveform, antennas : of the run
-    longest_delay : of a path that is heard at all [s]
+    longest_delay : of a path that is received at all [s]
     times : (K,) rising [s]
     over_noise : by link (K,) the power of a path over the noise of a range-Doppler cell, per power
         gain; 0 where the link is not received
@@ -84,12 +84,12 @@ def resolution_cell(waveform: Waveform, delay: np.ndarray, rate: np.ndarray) -> 
     return beat * w.num_chirps + turns % w.num_chirps
 
 
-class Heard(NamedTuple):
+class VisibleCells(NamedTuple):
     """Scatterers as a link receives them at one instant.
 
     Attributes
     ----------
-    which : (K,) of those that are heard
+    which : (K,) of those that are received
     power : (K,) mean power over the noise of a range-Doppler cell
     cell : (K,) int from 0 in which each is seen
     """
@@ -99,33 +99,35 @@ class Heard(NamedTuple):
     cell: np.ndarray
 
 
-def covered(cells: Cells, heard: Sequence[Heard], finest: np.ndarray, error_db: float) -> Cells:
+def merged_below_noise(
+    cells: Cells, visible: Sequence[VisibleCells], finest: np.ndarray, error_db: float
+) -> Cells:
     """Merge a link's scatterers as far as noise covers the error.
 
     Parameters
     ----------
-    heard : at the instants that show how the run changes
+    visible : at the instants that show how the run changes
     finest : (N,) area to which the surface is cut at each of the N cells [m^2]
     error_db : of noise plus clutter that nine of ten range-Doppler cells keep to
     """
     for eased in EASED:
         limit = np.full(len(cells), np.inf)
-        for some in heard:
+        for some in visible:
             area = allowed_area(some, cells.area, finest, 10 ** (error_db / 10) - 1, eased)
             limit[some.which] = np.minimum(limit[some.which], area)
         place, left = merge(cells, limit)
         times = np.zeros(len(cells))
         times[place] = left.area / cells.area[place]
-        if eased == EASED[-1] or _within(error_db, times, heard):
+        if eased == EASED[-1] or _within(error_db, times, visible):
             break
     return left
 
 
-def _within(error_db: float, times: np.ndarray, heard: Sequence[Heard]) -> bool:
+def _within(error_db: float, times: np.ndarray, visible: Sequence[VisibleCells]) -> bool:
     """Return whether nine of ten range-Doppler cells keep an error at every instant, among all and
     among those whose clutter is over the noise, if scatterers (N,) represent multiples of their
     power."""
-    for which, power, cell in heard:
+    for which, power, cell in visible:
         every, left = np.bincount(cell, power), np.bincount(cell, power * times[which])
         held = np.flatnonzero(every)
         error, loud = apart_db(every[held], left[held]), every[held] > 1
@@ -140,7 +142,7 @@ def apart_db(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def allowed_area(
-    heard: Heard, area: np.ndarray, finest: np.ndarray, error: float, eased: float
+    visible: VisibleCells, area: np.ndarray, finest: np.ndarray, error: float, eased: float
 ) -> np.ndarray:
     """Largest areas that scatterers may stand for at one instant.
 
@@ -153,9 +155,9 @@ def allowed_area(
 
     Returns
     -------
-    area : (K,) of those that are heard [m^2]
+    area : (K,) of those that are received [m^2]
     """
-    which, power, cell = heard
+    which, power, cell = visible
     clutter = np.bincount(cell, power)[cell]
     over = (1 + clutter) / clutter
     most = eased * error**2 * (1 + clutter) * np.minimum(ONE_ERRS, ALL_ERR * over)

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isac_rt.propagation.clutter.cells import Density, cut
-from isac_rt.propagation.clutter.sight import Flight
+from isac_rt.propagation.clutter.visibility import Flight
 from isac_rt.propagation.legs.geometry import LIFT, plane_of_each_face
 from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.legs.reflection import slab_coefficients
@@ -72,8 +72,8 @@ def strongest(
     at most `most`; and the share that all others send on."""
     if not most or not city.num_faces:
         return [], 0.0
-    places = flight.knots[
-        np.unique(np.linspace(0, len(flight.knots) - 1, PLACES).round().astype(int))
+    places = flight.time_samples[
+        np.unique(np.linspace(0, len(flight.time_samples) - 1, PLACES).round().astype(int))
     ]
     cells = cut(city, np.ones(city.num_faces, bool), places, COARSE, seed)
     _, group = np.unique(

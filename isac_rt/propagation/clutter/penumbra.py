@@ -1,8 +1,8 @@
 r"""Where a flight carries the sight of scatterers across shadow edges, and how wide the penumbra is
 there.
 
-A scatterer that is seen from one knot of a flight and not from the next has crossed a shadow edge
-in between. Rays bisect the place; the ray that just fails hits what is in the way within
+A scatterer that is seen from one time sample of a flight and not from the next has crossed a shadow
+edge in between. Rays bisect the place; the ray that just fails hits what is in the way within
 millimetres of its edge, so that the edge is that of the triangle hit which is nearest. From it come
 the distances d_1 (to the terminal) and d_2 (to the scatterer) and the direction m across the edge
 and the ray, and with them the flight that takes the scatterer one Fresnel unit into the shadow,
@@ -30,7 +30,7 @@ from isac_rt.propagation.legs.geometry import LIFT
 from isac_rt.propagation.legs.rays import Triangles, computed, rays
 
 HALVINGS = 6
-"""Of the flight between two knots; what is left is 8 mm of half a metre."""
+"""Of the flight between two time samples; what is left is 8 mm of half a metre."""
 REACH = 4.0
 """Fresnel units on either side after which a scatterer is dark or lit; the ripple and the tail are
 6 % there, and tapered."""
@@ -58,14 +58,14 @@ def penumbra(units: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Crossings:
-    """K scatterers that come into sight or are lost between two knots.
+    """K scatterers that come into sight or are lost between two time samples.
 
     Attributes
     ----------
     index : (K,) int32
-    where : (K,) float32 share of the way from knot to knot
+    where : (K,) float32 share of the way from time sample to time sample
     width : (K,) float32 flight per Fresnel unit [m]; inf where the edge was not found
-    gained : (K,) bool, seen from the second knot
+    gained : (K,) bool, seen from the second time sample
     """
 
     index: np.ndarray
@@ -88,7 +88,11 @@ class Facets(NamedTuple):
 
 
 def crossings(
-    triangles: Triangles, knots: np.ndarray, seen: np.ndarray, facets: Facets, wavelength: float
+    triangles: Triangles,
+    time_samples: np.ndarray,
+    seen: np.ndarray,
+    facets: Facets,
+    wavelength: float,
 ) -> Crossings:
     """Return what changes between two time samples (2, 3), for N points on surfaces, seen (2, N)
     from either."""
@@ -98,17 +102,17 @@ def crossings(
     low, high = np.zeros(index.size), np.ones(index.size)
     for _ in range(HALVINGS if index.size else 0):
         middle = (low + high) / 2
-        ray = _rays(some, _between(knots, middle))
+        ray = _rays(some, _between(time_samples, middle))
         now = ~computed(triangles.scene.ray_test(ray))
         after = now == gained
         low, high = np.where(after, low, middle), np.where(after, middle, high)
     where = (low + high) / 2
-    width = _widths(triangles, knots, np.where(gained, low, high), some, wavelength)
+    width = _widths(triangles, time_samples, np.where(gained, low, high), some, wavelength)
     return Crossings(index, where.astype(np.float32), width.astype(np.float32), gained)
 
 
-def _between(knots: np.ndarray, share: np.ndarray) -> np.ndarray:
-    return knots[0] + share[:, None] * (knots[1] - knots[0])
+def _between(time_samples: np.ndarray, share: np.ndarray) -> np.ndarray:
+    return time_samples[0] + share[:, None] * (time_samples[1] - time_samples[0])
 
 
 def _rays(facets: Facets, places: np.ndarray) -> mi.Ray3f:
@@ -121,14 +125,18 @@ def _rays(facets: Facets, places: np.ndarray) -> mi.Ray3f:
 
 
 def _widths(
-    triangles: Triangles, knots: np.ndarray, dark: np.ndarray, facets: Facets, wavelength: float
+    triangles: Triangles,
+    time_samples: np.ndarray,
+    dark: np.ndarray,
+    facets: Facets,
+    wavelength: float,
 ) -> np.ndarray:
     """(K,) flight per Fresnel unit at the edges that hide points from the shares `dark` of the way
-    between two knots."""
+    between two time samples."""
     points, normals, area = facets
     if not points.shape[0]:
         return np.zeros(0)
-    places = _between(knots, dark)
+    places = _between(time_samples, dark)
     hit = triangles.scene.ray_intersect_preliminary(_rays(facets, places))
     dr.eval(hit)  # once, not for each of its parts
     near, triangle = np.asarray(hit.t, np.float64), triangles.rows(hit)
@@ -148,7 +156,7 @@ def _widths(
     across = np.cross(edge, ray)
     size = np.linalg.norm(across, axis=1)
     across /= np.maximum(size, 1e-9)[:, None]
-    flight = knots[1] - knots[0]
+    flight = time_samples[1] - time_samples[0]
     pace = np.abs(across @ (flight / np.linalg.norm(flight)))
     before = length - behind
     unit = wavelength * behind * length / (2 * before)

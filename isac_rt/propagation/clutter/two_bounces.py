@@ -1,4 +1,4 @@
-r"""Clutter of two bounces: the scatterers of the field, lit or heard by way of a mirror.
+r"""Clutter of two bounces: the scatterers of the field, lit or received by way of a mirror.
 
 Mirror then scatter, and scatter then mirror. The scatterers are those of one bounce, with the same
 amplitudes; the terminal at the mirror's side is its image, so that delay, rate, acceleration and
@@ -15,8 +15,8 @@ vertical, as for one bounce.
 
 On a terminal's link to itself the two orders are one way and its reverse: equal in length, and in
 phase where transmitter and receiver share one place, as backscatter is enhanced in nature. Sight by
-way of a mirror is tested at the knots of the flight, both legs and the mirror's rim, and blended in
-between.
+way of a mirror is tested at the time samples of the flight, both legs and the mirror's rim, and
+blended in between.
 
 Import only after `isac_rt.runtime.activate()`.
 """
@@ -35,16 +35,16 @@ from isac_rt.propagation.clutter.field import (
     scattered_power,
 )
 from isac_rt.propagation.clutter.mirrors import Mirror, shown, strongest
-from isac_rt.propagation.legs.bodies import Bodies
+from isac_rt.propagation.legs.discs import UavDiscs
 from isac_rt.propagation.legs.reflection import mirrored_field, slab_coefficients, vertical
 from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.propagation.ways import LinkState
+from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.mirrors import mirror_image, plane_crossing
 from isac_rt.world.swarm import Pose
 
 KNOTS_KEPT = 16
-"""Knots per terminal whose tests are remembered; a frame needs six."""
+"""Time samples per terminal whose tests are remembered; a frame needs six."""
 
 
 _Sight = tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]
@@ -109,7 +109,7 @@ class TwoBounces:
             for name, kept in self.mirrors.items()
         }
 
-    def seen(self, state: LinkState, bodies: Bodies | None = None) -> list[SeenByMirror]:
+    def seen(self, state: LinkState, discs: UavDiscs | None = None) -> list[SeenByMirror]:
         """Return the scatterers in sight of both ends, once for each mirror and order; poses in
         local coordinates."""
         sight, time = self._field.sight, state.epoch
@@ -118,9 +118,9 @@ class TwoBounces:
             (sight.share(name, pose, time), self._share(name, pose, time)) for name, pose in ends
         )
         out = self._between(state, tx, rx)
-        if bodies is not None:
+        if discs is not None:
             for found in out:
-                self._shade(found, state, bodies)
+                self._shade(found, state, discs)
         return out
 
     def from_places(self, state: LinkState) -> list[SeenByMirror]:
@@ -149,12 +149,12 @@ class TwoBounces:
         return out
 
     def paths(
-        self, state: LinkState, antennas: Antennas, bodies: Bodies | None = None
+        self, state: LinkState, antennas: Antennas, discs: UavDiscs | None = None
     ) -> list[PathSet]:
-        """The link's paths, one set for each mirror and order; poses, points and bodies in local
+        """The link's paths, one set for each mirror and order; poses, points and UAVs in local
         coordinates."""
         cells, out = self._field.cells, []
-        for part in self.seen(state, bodies):
+        for part in self.seen(state, discs):
             s = part.seen
             points, faces = self._chain(part, state)
             gain = cells.amplitude[s.index] * part.turn
@@ -184,24 +184,28 @@ class TwoBounces:
                 (index, np.ones(index.size, np.float32))
                 for index in self._test(name, pose.position)
             ]
-        knots = {knot: weight for knot, weight in flight.blend(time).items() if weight > 0}
-        tests = {knot: self._knot(name, knot) for knot in knots}
+        time_samples = {
+            time_sample: weight for time_sample, weight in flight.blend(time).items() if weight > 0
+        }
+        tests = {time_sample: self._time_sample(name, time_sample) for time_sample in time_samples}
         out = []
         for number in range(len(mirrors)):
             share = np.zeros(len(self._field.cells), np.float32)
-            for knot, weight in knots.items():
-                share[tests[knot][number]] += np.float32(weight)
+            for time_sample, weight in time_samples.items():
+                share[tests[time_sample][number]] += np.float32(weight)
             index = np.flatnonzero(share).astype(np.int32)
             out.append((index, share[index]))
         return out
 
-    def _knot(self, name: str, knot: int) -> list[np.ndarray]:
-        if (name, knot) not in self._shown:
+    def _time_sample(self, name: str, time_sample: int) -> list[np.ndarray]:
+        if (name, time_sample) not in self._shown:
             mine = [key for key in self._shown if key[0] == name]
             for key in mine[: len(mine) - KNOTS_KEPT + 1]:
                 del self._shown[key]
-            self._shown[name, knot] = self._test(name, self._field.sight.flights[name].knots[knot])
-        return self._shown[name, knot]
+            self._shown[name, time_sample] = self._test(
+                name, self._field.sight.flights[name].time_samples[time_sample]
+            )
+        return self._shown[name, time_sample]
 
     def _test(self, name: str, place: np.ndarray) -> list[np.ndarray]:
         cells, mirrors = self._field.cells, self.mirrors[name]
@@ -225,7 +229,7 @@ class TwoBounces:
             end = mirror.image(state.end)
         there, back = (motion_to(self._field.cells.points[index], body) for body in (start, end))
         length, rate, accel = (one + other for one, other in zip(there[:3], back[:3], strict=True))
-        # the terminal at the mirror's side sends to, or hears from, where its image does
+        # the terminal at the mirror's side sends to, or receives from, where its image does
         departure, arrival = there[3], back[3]
         if before:
             departure = mirror_image(departure, mirror.normal)
@@ -270,14 +274,14 @@ class TwoBounces:
         scale = self._wavelength / (4 * np.pi)
         return scale * passed * np.sqrt(power) / (seen.tx_radius * seen.rx_radius)
 
-    def _shade(self, part: SeenByMirror, state: LinkState, bodies: Bodies) -> None:
-        """Put it into the shadows of the swarm's bodies, on both ways."""
+    def _shade(self, part: SeenByMirror, state: LinkState, discs: UavDiscs) -> None:
+        """Put it into the shadows of the swarm's UAVs, on both ways."""
         points, _ = self._chain(part, state)
         split = 2 if part.before else 1
         ends = [np.broadcast_to(p.position, (len(points), 1, 3)) for p in (state.start, state.end)]
         there = np.concatenate([ends[0], points[:, :split]], axis=1)
         back = np.concatenate([points[:, split - 1 :], ends[1]], axis=1)
         part.seen.magnitude[:] *= np.abs(
-            bodies.factor(there, self._wavelength, bodies.spared([(state.link.tx,)]))
-            * bodies.factor(back, self._wavelength, bodies.spared([(state.link.rx,)]))
+            discs.factor(there, self._wavelength, discs.spared([(state.link.tx,)]))
+            * discs.factor(back, self._wavelength, discs.spared([(state.link.rx,)]))
         )

@@ -1,2 +1,2 @@
-"""Ways from one end to the other over walls, edges and bodies, in float64: what a path of several
+"""Ways from one end to the other over walls, edges and UAVs, in float64: what a path of several
 legs is made of."""

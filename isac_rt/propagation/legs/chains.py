@@ -1,12 +1,13 @@
 """Interaction sequences: rays find which walls a wave may meet one after the other, once for a
 stretch of flight.
 
-Rays leave a terminal from knots, places at even distances along its planned flight, in directions
-that differ from knot to knot, and are mirrored at each wall that they hit. What they find are
-chains of planes, whatever the UAV that they lead to. The chains of the knots about an instant are
-pooled; images then say which of them are paths (`legs.images`). Knots, directions and pools are
-functions of the plan of the flight: a frame is the same whether others were computed before it or
-not. From a place off the plan as many rays are sent as from the knots of a pool together.
+Rays leave a terminal from time samples, places at even distances along its planned flight, in
+directions that differ from time sample to time sample, and are mirrored at each wall that they hit.
+What they find are chains of planes, whatever the UAV that they lead to. The chains of the time
+samples about an instant are pooled; images then say which of them are paths (`legs.images`). Time
+samples, directions and pools are functions of the plan of the flight: a frame is the same whether
+others were computed before it or not. From a place off the plan as many rays are sent as from the
+time samples of a pool together.
 
 Local coordinates. Import only after `isac_rt.runtime.activate()`.
 """
@@ -21,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from isac_rt.propagation.clutter.sight import Flight
+from isac_rt.propagation.clutter.visibility import Flight
 from isac_rt.propagation.legs.geometry import LIFT
 from isac_rt.propagation.legs.rays import rays
 from isac_rt.storage import checksum, kept, pack
@@ -31,15 +32,15 @@ from isac_rt.world.mirrors import mirror_image
 from isac_rt.world.swarm import Pose
 
 AROUND = 2
-"""Knots on each side of the nearest one whose chains are pooled."""
+"""Time samples on each side of the nearest one whose chains are pooled."""
 TOGETHER = AROUND + 1
-"""Knots whose chains are sought, and kept for later runs, at once: no more than the first frame
-needs."""
+"""Time samples whose chains are sought, and kept for later runs, at once: no more than the first
+frame needs."""
 FAR = 1e6
 """Reach of the rays [m]."""
 _TURN, _SHIFT = 0.5698402909980532, 0.7548776662466927
-"""Steps of the plane's most even sequence: turn of the directions from knot to knot, and their
-shift along the axis."""
+"""Steps of the plane's most even sequence: turn of the directions from time sample to time sample,
+and their shift along the axis."""
 
 
 class Chains(NamedTuple):
@@ -64,10 +65,10 @@ class Search:
     ----------
     scenes : of the city; rays are sent in Sionna's
     city : CityMesh
-    num_rays : per knot
+    num_rays : per time sample
     depth : most planes of a chain
-    flights : of the terminals, with their knots; what flies without one is searched from where it
-        is
+    flights : of the terminals, with their time samples; what flies without one is searched from
+        where it is
     """
 
     def __init__(
@@ -87,7 +88,7 @@ class Search:
         self._share: int | None = None
 
     def half(self, which: int) -> Search:
-        """The same search by the even (0) or the odd (1) knots alone: two searches that know
+        """The same search by the even (0) or the odd (1) time samples alone: two searches that know
         nothing of each other."""
         out = copy.copy(self)
         out._share, out._pools = which, {}
@@ -98,29 +99,31 @@ class Search:
         flight = self._flights.get(name)
         if flight is None or not flight.holds(pose, time):
             return self._pool([self._sent(pose.position, n) for n in self._window(0)])
-        knot = int(np.clip(np.rint(flight.number(time)), 0, len(flight.knots) - 1))
-        if name not in self._pools or self._pools[name][0] != knot:
-            found = [self._knot(name, flight, n) for n in self._window(knot)]
-            self._pools[name] = knot, self._pool(found)
+        time_sample = int(np.clip(np.rint(flight.number(time)), 0, len(flight.time_samples) - 1))
+        if name not in self._pools or self._pools[name][0] != time_sample:
+            found = [self._time_sample(name, flight, n) for n in self._window(time_sample)]
+            self._pools[name] = time_sample, self._pool(found)
             far = TOGETHER + AROUND
-            for key in [k for k in self._kept if k[0] == name and abs(k[1] - knot) > far]:
+            for key in [k for k in self._kept if k[0] == name and abs(k[1] - time_sample) > far]:
                 del self._kept[key]
         return self._pools[name][1]
 
-    def _window(self, knot: int) -> list[int]:
-        """Numbers of the knots that are pooled; before the first and after the last knot others
-        are sent from these, in directions of their own."""
-        every = range(knot - AROUND, knot + AROUND + 1)
+    def _window(self, time_sample: int) -> list[int]:
+        """Numbers of the time samples that are pooled; before the first and after the last time
+        sample others are sent from these, in directions of their own."""
+        every = range(time_sample - AROUND, time_sample + AROUND + 1)
         return [n for n in every if self._share is None or n % 2 == self._share]
 
-    def _knot(self, name: str, flight: Flight, number: int) -> Chains:
+    def _time_sample(self, name: str, flight: Flight, number: int) -> Chains:
         if (name, number) not in self._kept:
-            first, count = number // TOGETHER * TOGETHER, len(flight.knots)
+            first, count = number // TOGETHER * TOGETHER, len(flight.time_samples)
             near = range(max(first, -AROUND), min(first + TOGETHER, count + AROUND))
-            places = flight.knots[np.clip(near, 0, count - 1)]
+            places = flight.time_samples[np.clip(near, 0, count - 1)]
 
             def found() -> list[list[np.ndarray]]:
-                return [[*self._sent(*knot)] for knot in zip(places, near, strict=True)]
+                return [
+                    [*self._sent(*time_sample)] for time_sample in zip(places, near, strict=True)
+                ]
 
             city = self._city
             mesh = [city.vertices, city.faces, city.plane_of_face]
@@ -144,7 +147,7 @@ class Search:
         return levels.chains()
 
     def _sent(self, place: np.ndarray, number: int) -> Chains:
-        """Chains that the rays of a knot meet."""
+        """Chains that the rays of a time sample meet."""
         levels = _Levels(self._city.num_faces)
         along = directions(self._num_rays, number)
         at, chain = np.broadcast_to(place, along.shape), np.full(len(along), -1)

@@ -1,4 +1,4 @@
-"""Bodies so near to a surface that the ray tracer passes over its reflections in silence."""
+"""UAVs so near to a surface that the ray tracer passes over its reflections in silence."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class ClearanceWarning(UserWarning):
 
 
 class Clearance:
-    """Watches the bodies of a run and warns once of each that comes too near to the city."""
+    """Watches the UAVs of a run and warns once of each that comes too near to the city."""
 
     def __init__(self, city: CityMesh) -> None:
         self._city = city
         self._warned: set[str] = set()
 
     def check(self, places: Mapping[str, np.ndarray], time: float) -> None:
-        """Warn of bodies at local positions (3,)."""
+        """Warn of UAVs at local positions (3,)."""
         city, names = self._city, [name for name in places if name not in self._warned]
         every = np.array([places[name] for name in names]).reshape(-1, 3)
         body, face = _beside(city.normals, city.plane_offsets, *city.boxes, every, CLEARANCE)

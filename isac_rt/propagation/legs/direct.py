@@ -1,4 +1,4 @@
-"""Straight legs between bodies, bent round the shadow edge that matters: no leg is switched when it
+"""Straight legs between UAVs, bent round the shadow edge that matters: no leg is switched when it
 meets the city's edges.
 
 On the lit side a leg stays straight and its amplitude ripples; in the shadow it runs by way of the
@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from isac_rt.frame.link import Link
-from isac_rt.propagation.legs.bodies import Bodies
 from isac_rt.propagation.legs.diffraction import edge_factor
+from isac_rt.propagation.legs.discs import UavDiscs
 from isac_rt.propagation.legs.edges import ShadowEdges
 from isac_rt.propagation.legs.geometry import Legs, straight
 from isac_rt.propagation.legs.legset import LegSet, leg_set
@@ -23,18 +23,18 @@ from isac_rt.world.swarm import Pose
 Direct = tuple[np.ndarray, Legs]
 
 
-def past_edges_and_bodies(
+def past_edges_and_discs(
     legs: dict[Link, LegSet],
     poses: dict[str, Pose],
     edges: ShadowEdges,
-    bodies: Bodies,
+    discs: UavDiscs,
     wavelength: float,
 ) -> dict[Link, LegSet]:
     """Traced legs of all pairs with straight ones that bend (in place of those that are there or
-    not), past the swarm's bodies."""
-    direct, out = direct_legs(poses, list(legs), edges, bodies, wavelength), {}
+    not), past the swarm's UAVs."""
+    direct, out = direct_legs(poses, list(legs), edges, discs, wavelength), {}
     empty = np.zeros((1, 0), np.int64)
-    factors = _past_bodies(legs, poses, bodies, wavelength)
+    factors = _past_discs(legs, poses, discs, wavelength)
     for (pair, found), factor in zip(legs.items(), factors, strict=True):
         rest = np.flatnonzero(found.bounces)
         mirrored = found.select(rest)
@@ -45,10 +45,10 @@ def past_edges_and_bodies(
     return out
 
 
-def _past_bodies(
-    legs: dict[Link, LegSet], poses: dict[str, Pose], bodies: Bodies, wavelength: float
+def _past_discs(
+    legs: dict[Link, LegSet], poses: dict[str, Pose], discs: UavDiscs, wavelength: float
 ) -> list[np.ndarray]:
-    """Factors of the bodies for the mirrored legs of each pair."""
+    """Factors of the UAVs for the mirrored legs of each pair."""
     sizes = [len(found.amplitude) for found in legs.values()]
     owner, factor = np.repeat(np.arange(len(sizes)), sizes), np.ones(sum(sizes), complex)
     bounces = np.concatenate([found.bounces for found in legs.values()])
@@ -56,11 +56,11 @@ def _past_bodies(
     starts, ends = (
         np.array([poses[pair[side]].position for pair in legs])[owner] for side in (0, 1)
     )
-    spared = bodies.spared(list(legs))[owner]
+    spared = discs.spared(list(legs))[owner]
     for count in range(1, points.shape[1] + 1):
         which = np.flatnonzero(bounces == count)
         stops = starts[which, None], points[which, :count], ends[which, None]
-        factor[which] = bodies.factor(np.concatenate(stops, axis=1), wavelength, spared[which])
+        factor[which] = discs.factor(np.concatenate(stops, axis=1), wavelength, spared[which])
     return np.split(factor, np.cumsum(sizes)[:-1])
 
 
@@ -68,10 +68,10 @@ def direct_legs(
     poses: dict[str, Pose],
     pairs: list[Link],
     edges: ShadowEdges,
-    bodies: Bodies,
+    discs: UavDiscs,
     wavelength: float,
 ) -> dict[Link, Direct]:
-    """Amplitude (0 or 1,) and leg of every pair of bodies at different places.
+    """Amplitude (0 or 1,) and leg of every pair of UAVs at different places.
 
     `points` (.., 1, 3) of a leg holds the edge round which it bends, else NaN.
     """
@@ -85,11 +85,11 @@ def direct_legs(
     )
     bends = edges.bends(starts, ends)
     factors = edge_factor(bends.nu)
-    spared, there = bodies.spared(apart), factors != 0
+    spared, there = discs.spared(apart), factors != 0
     straight_on, round_edge = there & (bends.nu <= 0), there & (bends.nu > 0)
     for which, *between in ((straight_on,), (round_edge, bends.points)):
         stops = np.stack([stop[which] for stop in (starts, *between, ends)], axis=1)
-        factors[which] *= bodies.factor(stops, wavelength, spared[which])
+        factors[which] *= discs.factor(stops, wavelength, spared[which])
     out = {}
     for k in np.flatnonzero(there):
         start, end = (poses[name] for name in apart[k])

@@ -240,7 +240,7 @@ class Images:
 
 
 def _stacked(motion: np.ndarray) -> Pose:
-    """Bodies in motion (K, 3, 3), one a row."""
+    """UAVs in motion (K, 3, 3), one a row."""
     return Pose(motion[:, 0], motion[:, 1], motion[:, 2], np.eye(3))
 
 

@@ -103,7 +103,7 @@ def test_everybody_finds_everybody():
     assert got.blocks == {"A": 4, "B": 7}
     assert got.num_frames == 2 * 17
     assert got.duration == pytest.approx(34 * W.frame_duration)
-    assert got.links["A", "P"].heard_block == 6
+    assert got.links["A", "P"].received_block == 6
     for (at, pt), link in got.links.items():
         assert link.identified, (at, pt)
         assert link.acknowledged, (at, pt)

@@ -58,7 +58,7 @@ class Air:
     hot: Callable[[str, int], bool] = lambda name, block: False
     message: Callable[[str, int, int], Message | None] = lambda name, frame, block: None
     sight: Callable[[str, int, int], float | None] = lambda name, frame, group: None
-    heard: list[Heard] = field(default_factory=list)
+    received_words: list[Heard] = field(default_factory=list)
 
     def establish(self, monkeypatch: pytest.MonkeyPatch, n: Network):
         """The stages on samples that hold nothing but (listener, frame, first block, group)."""
@@ -74,7 +74,7 @@ class Air:
             samples[..., 3] = np.arange(W.num_groups)[:, None, None]
             sent = [transmission for transmission, _ in links]
             words = tuple(noise.seed_words.tolist())
-            self.heard.append(
+            self.received_words.append(
                 Heard(name, round(number), reference.first_block, sent, noise.power, words)
             )
             return IFCube(samples=samples, waveform=W, schedule=n.schedule, start_time=0.0)
@@ -121,7 +121,7 @@ class Air:
         return establish(n)
 
     def by(self, frame: int) -> list[Heard]:
-        return [h for h in self.heard if h.frame == frame]
+        return [h for h in self.received_words if h.frame == frame]
 
 
 def network(**change) -> Network:
@@ -154,12 +154,12 @@ def everything_is_heard(n: Network) -> Air:
 
     def message(name, frame, block):
         if name in runs:  # acknowledgments: group g of the run, of the g-th of this turn
-            turn = [h for h in air.heard if h.frame == frame][-1].sent
+            turn = [h for h in air.received_words if h.frame == frame][-1].sent
             group = block - runs[name]
             here = [t.name for t in turn if t.active is not None and t.active[group].any()]
             return Message(n.names.index(here[0]), runs[name]) if here else None
         own = runs[of[name]] + SHIFT[name]
-        sent = air.heard[-1].sent
+        sent = air.received_words[-1].sent
         announced = any(t.name == of[name] and t.active is not None for t in sent)
         found = announced and own <= block < own + 3
         return Message(n.names.index(of[name]), runs[of[name]]) if found else None
@@ -215,9 +215,9 @@ def test_the_timetable_on_paper(monkeypatch):
                 plan.append([(at, run, [*answers, *data])])
     assert len(plan) == 36
     for frame, receptions in enumerate(plan):
-        heard = air.by(frame)
-        assert [(h.name, h.block) for h in heard] == [r[:2] for r in receptions], frame
-        for h, (_, _, sent) in zip(heard, receptions, strict=True):
+        received_words = air.by(frame)
+        assert [(h.name, h.block) for h in received_words] == [r[:2] for r in receptions], frame
+        for h, (_, _, sent) in zip(received_words, receptions, strict=True):
             assert [(t.name, t.first_block) for t in h.sent] == [s[:2] for s in sent], frame
             for t, (name, _, mask) in zip(h.sent, sent, strict=True):
                 modulated = bool(t.payload.delay_symbols.any())
@@ -243,10 +243,10 @@ def test_noise_and_data_of_the_stages_are_all_different(monkeypatch):
     n = network(wishes={"A": 0, "B": 5, "P": 12}, listeners=listeners)
     air = Air()
     air.establish(monkeypatch, n)
-    assert len({h.words for h in air.heard}) == len(air.heard)
-    assert all(h.power == n.noise_power[h.name] for h in air.heard)
+    assert len({h.words for h in air.received_words}) == len(air.received_words)
+    assert all(h.power == n.noise_power[h.name] for h in air.received_words)
     said: dict[tuple[str, int], bytes] = {}
-    for h in air.heard:
+    for h in air.received_words:
         for t in h.sent:
             if t.active is None:
                 bits = t.payload.bits.tobytes()
@@ -294,7 +294,7 @@ def test_every_outcome_of_a_link(monkeypatch, external):
         got = Air(message=message, sight=sight).establish(monkeypatch, n)
         p, q = got.links["A", "P"], got.links["A", "Q"]
         understood, seen = said is not None, external or (said is not None and one)
-        assert p.heard_block == (4 if understood else None)
+        assert p.received_block == (4 if understood else None)
         assert p.message == messages.get(said)
         assert p.identified is (said == right)
         assert p.sent_acknowledgment is (understood and seen)
@@ -303,7 +303,7 @@ def test_every_outcome_of_a_link(monkeypatch, external):
         else:
             assert (p.clock is not None) is (understood and one and two)
         assert p.acknowledged is (back == right and p.clock is not None)
-        assert (q.heard_block, q.message, q.identified) == (None, None, False)
+        assert (q.received_block, q.message, q.identified) == (None, None, False)
         assert not q.sent_acknowledgment and not q.acknowledged
         assert got.missed_announcements == 1 + (said is None)
         assert got.wrong_announcements == (said == other)
@@ -354,19 +354,19 @@ def test_what_most_of_a_run_says_is_believed(monkeypatch):
         most = [m for m in (7, 11) if counts[m] >= 2]
         link = got.links["A", "P"]
         assert link.message == (Message(0, most[0]) if most else None)
-        assert link.heard_block == (8 + carried.index(most[0]) if most else None)
+        assert link.received_block == (8 + carried.index(most[0]) if most else None)
 
 
 def test_blocks_missed_and_suspected(monkeypatch):
     """A sits in 4 to 6 and B hears 4, 6 and 11: one missed, one false, and the free run nearest to
     its wish; a third that hears all is left without, has no links, and is heard by nobody. Planted
     bugs: missed and false exchanged; only the first block of a run taken; its links forgotten."""
-    heard = {"A": (), "B": (4, 6, 11), "S": range(19)}
+    received_words = {"A": (), "B": (4, 6, 11), "S": range(19)}
     n = network(
         wishes={"A": 4, "B": 10, "S": None},
         listeners={"A": (), "B": (), "S": ("P", "Q")},
     )
-    air = Air(hot=lambda name, block: block in heard[name])
+    air = Air(hot=lambda name, block: block in received_words[name])
     got = air.establish(monkeypatch, n)
     assert got.blocks == {"A": 4, "B": 8, "S": None}
     assert got.missed_blocks == {"A": 0, "B": 1, "S": 0}
@@ -374,4 +374,4 @@ def test_blocks_missed_and_suspected(monkeypatch):
     assert got.num_frames == 7 + 8 + 7 + 8 + 7
     assert set(got.links) == {("S", "P"), ("S", "Q")}
     assert got.missed_announcements == 2
-    assert all(a.frame <= b.frame for a, b in pairwise(air.heard))
+    assert all(a.frame <= b.frame for a, b in pairwise(air.received_words))

@@ -89,13 +89,13 @@ def test_the_path_over_frames_far_apart():
     anywhere, one in ten from another direction. Planted bugs: the rate within frames with the
     other sign, chirps off the comb counted among the symbols."""
     w, rng = Waveform(), np.random.default_rng(23)
-    length, rate, bend, arrival = 141.27, -31.3, 5.0, np.array([-0.42, 0.17])
+    length, rate, curvature, arrival = 141.27, -31.3, 5.0, np.array([-0.42, 0.17])
     slope = w.bandwidth / w.chirp_duration
     kept = []
     for n in range(4):
         t = 0.045 * n + w.chirp_time + w.chirp_duration / 2 - w.frame_duration / 2
-        tau = (length + rate * t + bend * t * t / 2) / C
-        doppler = (rate + bend * t) / C * (w.carrier_frequency + slope * w.chirp_duration / 2)
+        tau = (length + rate * t + curvature * t * t / 2) / C
+        doppler = (rate + curvature * t) / C * (w.carrier_frequency + slope * w.chirp_duration / 2)
         cells = (slope * tau + doppler) * w.sampled_duration + rng.integers(0, 512, t.shape)
         cells += 0.08 * rng.standard_normal(t.shape)
         lost = rng.random(t.shape) < 1 / 15
@@ -109,7 +109,7 @@ def test_the_path_over_frames_far_apart():
         kept.append(Peaks(0.045 * n, True, w, None, *parts, 1.0))
     found = acquire(kept, ANTENNAS, ORDER)
     t = 0.135
-    truth = length + rate * t + bend * t * t / 2, rate + bend * t
+    truth = length + rate * t + curvature * t * t / 2, rate + curvature * t
     deviations = np.sqrt(np.diag(found.covariance))
     assert deviations[0] < 0.01 and deviations[1] < 0.2
     # the window's middle lies 6 us beside the chirp's: 0.2 mm
@@ -127,11 +127,11 @@ def test_whole_cells_from_frame_to_frame_are_no_rate():
     cell = w.range_cell(1)
     for draw in range(60):
         count = 2 + draw % 7
-        rate, bend = rng.uniform(-38, 38) / cell, rng.uniform(-20, 20) / cell
+        rate, curvature = rng.uniform(-38, 38) / cell, rng.uniform(-20, 20) / cell
         seen = []
         for middle in 0.045 * np.arange(1 - count, 1):
             t = middle + time
-            place = 141.3 + rate * t + bend * np.minimum(t + 0.1, 0.0) ** 2 / 2
+            place = 141.3 + rate * t + curvature * np.minimum(t + 0.1, 0.0) ** 2 / 2
             symbols = rng.integers(0, 512, time.size)
             noise = 0.013 * rng.standard_normal(time.size)
             seen.append(_Seen(True, middle, time, place + symbols + noise))

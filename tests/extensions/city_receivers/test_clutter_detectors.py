@@ -197,7 +197,7 @@ def test_detections_and_births_keep_their_rates_in_noise():
     settings = Receivers(
         clutter_detector="angle_doppler", false_alarm_rate=4e-3, update_false_alarm_rate=2e-2
     )
-    (judged,) = AngleDoppler(settings).judge([maps], sent, Hints(nothing))
+    (judged,) = AngleDoppler(settings).test_cells([maps], sent, Hints(nothing))
     for ratio, rate in ((judged.ratio, 2e-2), (judged.sure, 4e-3)):
         hits, cells = int((ratio > 1).sum()), ratio.size
         assert stats.binom.ppf(FALSE_FAILURE, cells, rate / 3) <= hits
@@ -263,7 +263,7 @@ def test_background_is_noise_and_expected_clutter():
     maps = maps_of(w, schedule, payload, [], FEW, 110, noise=0.7, seed=2)
     settings = Receivers(clutter_detector="angle_doppler")
     sent = known(w, schedule, payload, FEW)
-    (judged,) = AngleDoppler(settings).judge([maps], sent, Hints(guess))
+    (judged,) = AngleDoppler(settings).test_cells([maps], sent, Hints(guess))
     noise = judged.level - expected_power(guess, sent, 110)
     assert np.ptp(noise) < 1e-5 * judged.level.max()
     mean = (np.abs(maps) ** 2).mean()

@@ -18,7 +18,7 @@ C = 299_792_458.0
 W = Waveform(num_samples=256)
 VELOCITY = np.array([3.1, 7.7, -1.9])
 MISTAKE = np.array([0.13, -0.1, 0.12])
-ROWS, LOOKS, COUNT = 128, 12, 3000
+ROWS, BORESIGHT_SAMPLES, COUNT = 128, 12, 3000
 
 
 def surroundings(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -60,7 +60,7 @@ def power_of(
         )
         white *= np.where(n < size, np.sin(np.pi * (n + 0.5) / size) ** 2, 0)[:, None]
         x = np.fft.fft(((fast * a) @ slow.T + white) * window, axis=0)[:ROWS]
-        out += np.abs(np.fft.fft(x, axis=1)) ** 2 / LOOKS
+        out += np.abs(np.fft.fft(x, axis=1)) ** 2 / BORESIGHT_SAMPLES
     return np.fft.fftshift(out, axes=1)
 
 
@@ -80,13 +80,17 @@ def test_velocity_and_level_come_back_from_the_clutter(targets: int):
         2 * ranges / C, -2 * (towards @ wrong) / C, powers / 2, towards, towards
     )
     _, schedule, payload = frame(waveform=W)
-    floor = float(power_of(np.zeros((1, LOOKS)), np.zeros(1), np.zeros(1), noise, rng).mean())
+    floor = float(
+        power_of(np.zeros((1, BORESIGHT_SAMPLES)), np.zeros(1), np.zeros(1), noise, rng).mean()
+    )
     for _ in range(2):
         own = np.sqrt(powers / 2) * (rng.standard_normal((COUNT, 2)) @ np.array([1, 1j]))
         phase = np.exp(
-            40j * (towards @ rng.standard_normal((3, LOOKS)))
+            40j * (towards @ rng.standard_normal((3, BORESIGHT_SAMPLES)))
         )  # channels differ by their places
-        amplitude = np.concatenate([own[:, None] * phase, np.full((targets, LOOKS), 4.0 + 0j)])
+        amplitude = np.concatenate(
+            [own[:, None] * phase, np.full((targets, BORESIGHT_SAMPLES), 4.0 + 0j)]
+        )
         power = power_of(
             amplitude, np.append(ranges, at[0]), np.append(-(towards @ VELOCITY), at[1]), noise, rng
         )
@@ -169,7 +173,7 @@ def test_detectors_judge_with_the_corrected_clutter():
     )
     maps = (white * np.fft.ifftshift(np.sqrt(mean), axes=1)).astype(np.complex64)
     detector = AngleDoppler(Receivers(clutter_detector="angle_doppler"))
-    (judged,) = detector.judge([maps], known(W, schedule, payload), Hints(wrong))
+    (judged,) = detector.test_cells([maps], known(W, schedule, payload), Hints(wrong))
     strong = mean > 3 * noise
     off = judged.level[strong] / mean[strong] - 1
     assert strong.sum() > 500 and np.median(np.abs(off)) < 0.15

@@ -79,8 +79,8 @@ def test_a_weak_echo_is_found_where_it_is_expected_and_nowhere_else():
     settings = Receivers(clutter_detector="angle_doppler", gate_false_alarm_rate=1e-2)
     sought = np.array([at(*p, u) for p, u in zip(places[:3], towards[:3], strict=True)])
     gates = Gates(sought, np.tile([0.02, 0.05, 0.01, 0.01], (3, 1)))
-    (without,) = AngleDoppler(settings).judge([maps], SENT, Hints(NOTHING))
-    (judged,) = AngleDoppler(settings).judge([maps], SENT, Hints(NOTHING, gates))
+    (without,) = AngleDoppler(settings).test_cells([maps], SENT, Hints(NOTHING))
+    (judged,) = AngleDoppler(settings).test_cells([maps], SENT, Hints(NOTHING, gates))
     half = W.num_chirps // 2
     found = {(int(r), int(b) - half) for r, b in np.argwhere(judged.ratio > 1)}
     assert not (without.ratio > 1).any()
@@ -103,7 +103,7 @@ def test_a_strong_echo_from_elsewhere_is_none_of_a_gate():
     maps[c.tx, c.rx, 50, 4] += np.sqrt(0.01 * 2000 / len(c)) * wave
     settings = Receivers(clutter_detector="angle_doppler", gate_false_alarm_rate=1e-2)
     gates = Gates(np.array([at(50, 4, (0.2, -0.2))]), np.array([[0.02, 0.05, 0.01, 0.01]]))
-    (judged,) = AngleDoppler(settings).judge([maps], SENT, Hints(NOTHING, gates))
+    (judged,) = AngleDoppler(settings).test_cells([maps], SENT, Hints(NOTHING, gates))
     seen = judged.cosines[judged.ratio > 1]
     assert len(seen) and np.abs(seen - away).max() < 0.1
 

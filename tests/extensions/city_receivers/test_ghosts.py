@@ -15,7 +15,7 @@ from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.track.filter import Ambiguity, Gaussian
-from isac_rt.track.parts import KnownBody, Own
+from isac_rt.track.parts import Own, ReportedUav
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import Track, Tracker, track_set
 from isac_rt.world.city.mesh import CityMesh
@@ -158,9 +158,9 @@ def test_bodies_that_others_know_of_explain_echoes():
     nobody = np.zeros(1, bool)
     for spread, expected in ((1e-3, 2), (4.0, 0)):
         body = Gaussian(np.concatenate([BODY[:3] + ORIGIN, BODY[3:]]), np.eye(6) * spread)
-        told = track_set([Track.of_body(body)], OWN)
+        reported = track_set([Track.of_body(body)], OWN)
         leeway = Leeway(RESOLUTION, Ambiguity(PERIOD))
-        found = suspicion(tracks, OWN, Walls(wall()), leeway, told, nobody)
+        found = suspicion(tracks, OWN, Walls(wall()), leeway, reported, nobody)
         assert found.order.tolist() == [expected] and found.source.tolist() == [-1]
     beside = track(8, BODY[:3] + np.array([0.03, 0.2, 0.05]), BODY[3:])
     sure = track_set([Track.of_body(Gaussian(body.mean, np.eye(6) * 1e-3))], OWN)
@@ -176,13 +176,13 @@ def test_a_confirmed_echo_ends_once_its_body_is_known_three_frames():
     antennas = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
     leeway = Leeway.of(w, antennas, 2)
     body = [Gaussian(np.concatenate([BODY[:3] + ORIGIN, BODY[3:]]), np.eye(6) * 1e-4)]
-    for told, left in (((body,) * 3, 0), ((body, body, [], body, body), 1)):
+    for reported, left in (((body,) * 3, 0), ((body, body, [], body, body), 1)):
         tracker = Tracker(Tracking(), Ambiguity(PERIOD))
         tracker.state.tracks = [track(5, image, BODY[3:] * [-1, 1, 1])]
         ghosts = Ghosts(Walls(wall()), leeway)
-        for known in told:
+        for known in reported:
             assert len(tracker.tracks) == 1
-            ghosts.prune(tracker, Own(OWN, 0.0, reports=[KnownBody("", b) for b in known]))
+            ghosts.prune(tracker, Own(OWN, 0.0, reports=[ReportedUav("", b) for b in known]))
         assert len(tracker.tracks) == left
 
 
@@ -312,7 +312,7 @@ def test_reflections_at_a_passive_terminal_are_the_shortest_ways():
         np.testing.assert_allclose(echo[2:], towards[[0, 2]], rtol=0, atol=1e-12)
 
 
-def heard(number: int, path: float, rate: float, towards: np.ndarray) -> Track:
+def received(number: int, path: float, rate: float, towards: np.ndarray) -> Track:
     """A track whose path from `SENDER` by way of a point towards a direction has this length and
     rate."""
     from scipy.optimize import brentq
@@ -341,10 +341,10 @@ def test_a_passive_terminal_suspects_its_ghosts():
     aside = np.array([-0.6, 0.8, 0.0])
     tracks = [
         track(3, BODY[:3], BODY[3:]),
-        heard(5, *out[:2], ahead(out[2:])),
-        heard(6, *back[:2], ahead(back[2:])),
-        heard(7, *mirrored[:2], ahead(mirrored[2:])),
-        heard(8, *out[:2], aside),
+        received(5, *out[:2], ahead(out[2:])),
+        received(6, *back[:2], ahead(back[2:])),
+        received(7, *mirrored[:2], ahead(mirrored[2:])),
+        received(8, *out[:2], aside),
     ]
     everyone = track_set(tracks, OWN, track(1, SENDER[:3], SENDER[3:]))
     one_pass = RESOLUTION * [2, 2, 3, 3]

@@ -9,9 +9,14 @@ import pytest
 from crb_model import bound, samples
 from receiver_cubes import ANTENNAS, Path, cube
 
+from isac_rt.extensions.city_receivers.known_paths import seen_after
 from isac_rt.extensions.city_receivers.neighbours import phases
-from isac_rt.extensions.city_receivers.self_calibration import FREE, Change, SelfCalibration, Sight
-from isac_rt.extensions.city_receivers.sights import seen_after
+from isac_rt.extensions.city_receivers.self_calibration import (
+    FREE,
+    Change,
+    KnownDirection,
+    SelfCalibration,
+)
 from isac_rt.extensions.city_receivers.standard import active_terminal, passive_terminal
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import random_payload, unmodulated
@@ -19,7 +24,7 @@ from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.known import Known
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import ExpectedClutter, Look
+from isac_rt.receive.types import ExpectedClutter, PathChannels
 from isac_rt.storage import pack, unpack
 from isac_rt.track.filter import Gaussian
 from isac_rt.track.settings import Tracking
@@ -76,10 +81,10 @@ def in_bounds(y: np.ndarray, u, distance: float, passes: int, snr: float) -> np.
     return error[:2] / np.sqrt(np.diag(np.linalg.inv(2 * snr * F)))[:2]
 
 
-def look(values: np.ndarray, delay: float = 1e-7, rate: float = 0.0) -> Look:
+def look(values: np.ndarray, delay: float = 1e-7, rate: float = 0.0) -> PathChannels:
     modes = np.zeros((4, *values.shape), complex)
     modes[0] = values
-    return Look(delay, rate, modes, 1e3)
+    return PathChannels(delay, rate, modes, 1e3)
 
 
 def gains_of(one: SelfCalibration, passes: int) -> np.ndarray:
@@ -104,7 +109,7 @@ def test_ten_looks_bring_angles_within_1_db_of_the_bound(passes):
             turn = np.exp(2j * np.pi * rng.uniform())
             y = turn * channels(u, 9.3, passes) * g / gains_of(one, passes) + noise(rng, snr)
             one._taken_out = one._known()
-            one.learn(look(y), Sight(u, 9.3, 1e-4))
+            one.learn(look(y), KnownDirection(u, 9.3, 1e-4))
         for _ in range(6):
             u, distance = rng.uniform(-0.5, 0.5, 2), rng.uniform(8, 60)
             y = channels(u, distance, passes) * g + noise(rng, snr)
@@ -124,7 +129,7 @@ def test_tracked_directions_leave_what_turns_all_alike_and_nothing_else():
     for _ in range(10):
         y = channels(u, 20.0, 2) * g / gains_of(one, 2) + noise(rng, 1000.0)
         one._taken_out = one._known()
-        one.learn(look(y), Sight(u, 20.0, FREE))
+        one.learn(look(y), KnownDirection(u, 20.0, FREE))
     places = ANTENNAS.virtual_positions[:, [0, 2]]
     lines = np.hstack([np.ones((45, 1)), places])
     left = np.angle(g / gains_of(one, 2)).ravel()
@@ -204,10 +209,10 @@ def bent(values: np.ndarray, rng, schedule: np.ndarray) -> np.ndarray:
     """Samples behind elements with errors, slopes of phase and level over the chirp, and a response
     that all have in common."""
     x = np.linspace(-1, 1, W.num_samples)
-    sent, heard = errors(rng, 3), errors(rng, 15)
+    sent, received = errors(rng, 3), errors(rng, 15)
     slope = np.array([0.03, 0.05j]) @ rng.normal(size=(2, 15))
     common = np.exp(-0.15 * x + (0.1 - 0.2j) * (x**2 - 1 / 3))
-    gain = heard[:, None] * np.exp(slope[:, None] * x) * common
+    gain = received[:, None] * np.exp(slope[:, None] * x) * common
     out = values * gain[None, :, None, :]
     return (out * sent[schedule][:, None, :, None]).astype(np.complex64)
 
@@ -228,10 +233,12 @@ def test_samples_are_corrected_to_those_of_ideal_hardware():
     truth = cube(W, SCHEDULE, payload, [echo(6.37, mate)])
     path = replace(echo(6.37, mate), length=2 * 6.37 + late)
     for frame in range(10):
-        heard = cube(W, SCHEDULE, payload, [path], noise=0.3, seed=frame)
-        heard = replace(heard, samples=bent(heard.samples, np.random.default_rng(5), SCHEDULE))
+        received = cube(W, SCHEDULE, payload, [path], noise=0.3, seed=frame)
+        received = replace(
+            received, samples=bent(received.samples, np.random.default_rng(5), SCHEDULE)
+        )
         poses = [replace(OWN, position=place(6.37, mate))]
-        at.step(heard, payload, OWN, 0.05 * frame, mates=poses)
+        at.step(received, payload, OWN, 0.05 * frame, reported_poses=poses)
     clean = cube(W, SCHEDULE, payload, [path])
     clean = replace(clean, samples=bent(clean.samples, np.random.default_rng(5), SCHEDULE))
     found = at.equipment.hardware.correct(clean, 0.5).samples
@@ -255,10 +262,12 @@ def test_a_passive_terminal_finds_clock_and_gains_in_its_line_of_sight():
         path = Path(20.0 + C * late, C * 2e-9, level, tuple(u), (0.0, 0.0))
         modulated = frame >= 2
         data = random_payload(w, SCHEDULE, 8, rng) if modulated else unmodulated(w)
-        heard = cube(w, SCHEDULE, data, [path], noise=level**2 / 3, seed=frame)
-        heard = replace(heard, samples=heard.samples * gains[:, None, None].astype(np.complex64))
+        received = cube(w, SCHEDULE, data, [path], noise=level**2 / 3, seed=frame)
+        received = replace(
+            received, samples=received.samples * gains[:, None, None].astype(np.complex64)
+        )
         mate = replace(OWN, position=place(20.0, u))
-        reception, tracks = pt.step(heard, OWN, 0.05 * frame, modulated, mates=[mate])
+        reception, tracks = pt.step(received, OWN, 0.05 * frame, modulated, reported_poses=[mate])
         assert reception.line_of_sight
         assert tracks.ids[0] == 0  # the reference has not begun anew
         assert np.linalg.norm(tracks.mean[0, 3:]) < 2
@@ -289,15 +298,15 @@ def test_a_kept_state_goes_on_to_the_same_bits():
     rng = np.random.default_rng(3)
     one = SelfCalibration(W, ANTENNAS, 2)
     payload = unmodulated(W)
-    heard = cube(W, SCHEDULE, payload, [echo(6.0, (0.1, 0.2))], noise=1.0)
-    one.correct(heard, 0.0)
+    received = cube(W, SCHEDULE, payload, [echo(6.0, (0.1, 0.2))], noise=1.0)
+    one.correct(received, 0.0)
     one.learn(
         look(channels((0.1, 0.2), 6.0, 2) + noise(rng, 50.0)),
-        Sight(np.array([0.1, 0.2]), 6.0, 0.01, (4e-8, 0.0, 1e-10, 1e-10)),
+        KnownDirection(np.array([0.1, 0.2]), 6.0, 0.01, (4e-8, 0.0, 1e-10, 1e-10)),
     )
     again = SelfCalibration(W, ANTENNAS, 2)
     again.restore(unpack(*pack(one.memory())))
-    assert np.array_equal(one.correct(heard, 0.1).samples, again.correct(heard, 0.1).samples)
+    assert np.array_equal(one.correct(received, 0.1).samples, again.correct(received, 0.1).samples)
 
 
 @pytest.mark.slow
@@ -313,8 +322,8 @@ def test_ten_frames_of_samples_bring_angles_within_1_db_of_the_bound():
     ratios = []
     for seed in range(25):
         rng = np.random.default_rng(seed)
-        sent, heard = errors(rng, 3), errors(rng, 15)
-        gain = heard[None, :, None] * sent[SCHEDULE][:, None, :]
+        sent, received = errors(rng, 3), errors(rng, 15)
+        gain = received[None, :, None] * sent[SCHEDULE][:, None, :]
         at = active_terminal(W, ANTENNAS, settings, Tracking())
         for frame in range(14):
             u = rng.uniform(-0.5, 0.5, (3, 2))
@@ -327,7 +336,9 @@ def test_ten_frames_of_samples_bring_angles_within_1_db_of_the_bound():
             one = (sum(waves) * gain[..., None] + thermal).astype(np.complex64)
             frame_of = IFCube(samples=one, waveform=W, schedule=SCHEDULE, start_time=0.0)
             poses = [replace(OWN, position=place(p[0], p[2:])) for p in places[:2]]
-            found = at.step(frame_of, payload, OWN, 0.05 * frame, mates=poses)[0].detections
+            found = at.step(frame_of, payload, OWN, 0.05 * frame, reported_poses=poses)[
+                0
+            ].detections
             near = np.flatnonzero(np.abs(found.range - 11.7) < 0.5)
             if frame >= 10:
                 ratios.append((found.direction[near[0]] - u[2]) / std)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.extensions.city_receivers.standing import MEMORY_S, Standing
+from isac_rt.extensions.city_receivers.static_clutter import MEMORY_S, StaticClutter
 from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import UNAMBIGUOUS, Gaussian
@@ -51,7 +51,10 @@ def test_a_wall_is_a_crowd_and_who_flies_before_it_is_not():
     d = seen(
         0.0, [*WALL, (0.0, 28.0, 6.0), (10.0, 90.0, 5.0)], [(0, 0, 0)] * 5 + [(0, -2, 0), (0, 0, 0)]
     )
-    assert Standing(1.71, None, PERIOD).look(d, own(0.0), 0.0).tolist() == [True] * 5 + [False] * 2
+    assert (
+        StaticClutter(1.71, None, PERIOD).look(d, own(0.0), 0.0).tolist()
+        == [True] * 5 + [False] * 2
+    )
 
 
 def test_a_wall_beyond_the_view_is_seen_elsewhere_and_still_stands():
@@ -62,8 +65,8 @@ def test_a_wall_beyond_the_view_is_seen_elsewhere_and_still_stands():
     d = seen(0.0, places)
     seen_at = Detections(**{**vars(d), "direction": d.direction - [1.71, 0.0]})
     assert (d.direction[:, 0] > 0.9).all()
-    assert Standing(1.71, None, PERIOD).look(seen_at, own(0.0), 0.0).all()
-    assert not Standing(np.inf, None, PERIOD).look(seen_at, own(0.0), 0.0).any()
+    assert StaticClutter(1.71, None, PERIOD).look(seen_at, own(0.0), 0.0).all()
+    assert not StaticClutter(np.inf, None, PERIOD).look(seen_at, own(0.0), 0.0).any()
 
 
 def test_a_wall_along_the_wings_is_one_whatever_the_error():
@@ -76,32 +79,34 @@ def test_a_wall_along_the_wings_is_one_whatever_the_error():
     assert (np.linalg.norm(out + np.array([1.71, 0.0]), axis=1) > 1.007).all()
     for std, stands in ((0.01, True), (0.002, False)):
         seen_at = Detections(**{**vars(d), "direction": out, "std": np.full((5, 4), std)})
-        assert (Standing(1.71, None, PERIOD).look(seen_at, own(0.0), 0.0) == stands).all()
+        assert (StaticClutter(1.71, None, PERIOD).look(seen_at, own(0.0), 0.0) == stands).all()
 
 
 def test_velocities_are_folded():
     d = seen(0.0, WALL)
     folded = Detections(**{**vars(d), "velocity": d.velocity + PERIOD})
-    assert Standing(1.71, None, PERIOD).look(folded, own(0.0), 0.0).all()
+    assert StaticClutter(1.71, None, PERIOD).look(folded, own(0.0), 0.0).all()
 
 
 def test_a_uav_that_hovers_alone_is_no_crowd():
     """Thirty frames with errors of 0.3 m on each axis. Planted bug: echoes of one place count."""
-    rng, standing = np.random.default_rng(4), Standing(1.71, None, PERIOD)
+    rng, static_clutter = np.random.default_rng(4), StaticClutter(1.71, None, PERIOD)
     for frame in range(30):
         place = np.array([2.0, 25.0, 6.0]) + rng.normal(0, 0.3, 3)
         time = 0.05 * frame
-        assert not standing.look(seen(time, [place]), own(time), time).any()
+        assert not static_clutter.look(seen(time, [place]), own(time), time).any()
 
 
 def test_a_wall_that_shows_itself_piece_by_piece():
     """One place a frame: the fourth has three beside it. Long after, it is forgotten; kept by its
     memory it is not. Planted bugs: no memory; no end of it."""
-    standing = Standing(1.71, None, PERIOD)
-    found = [bool(standing.look(seen(t := 0.1 * k, [WALL[k]]), own(t), t)[0]) for k in range(4)]
+    static_clutter = StaticClutter(1.71, None, PERIOD)
+    found = [
+        bool(static_clutter.look(seen(t := 0.1 * k, [WALL[k]]), own(t), t)[0]) for k in range(4)
+    ]
     assert found == [False, False, False, True]
-    again = Standing(1.71, None, PERIOD)
-    again.restore(standing.memory())
+    again = StaticClutter(1.71, None, PERIOD)
+    again.restore(static_clutter.memory())
     assert again.look(seen(0.4, [WALL[4]]), own(0.4), 0.4).all()
     late = 0.4 + MEMORY_S + 0.01
     assert not again.look(seen(late, [WALL[0]]), own(late), late).any()
@@ -110,7 +115,7 @@ def test_a_wall_that_shows_itself_piece_by_piece():
 def test_only_what_could_start_a_track_makes_a_crowd():
     """What the city explains is no surface that it lacks."""
     d = seen(0.0, WALL, starts=[False] * 5)
-    assert not Standing(1.71, None, PERIOD).look(d, own(0.0), 0.0).any()
+    assert not StaticClutter(1.71, None, PERIOD).look(d, own(0.0), 0.0).any()
 
 
 @pytest.mark.parametrize(
@@ -124,11 +129,11 @@ def test_only_what_could_start_a_track_makes_a_crowd():
 )
 def test_a_track_that_stands_still_within_a_crowd(place, velocity, std, expected):
     """Planted bugs: the speed alone; the place alone."""
-    standing = Standing(1.71, None, PERIOD)
-    standing.look(seen(0.0, WALL), own(0.0), 0.0)
+    static_clutter = StaticClutter(1.71, None, PERIOD)
+    static_clutter.look(seen(0.0, WALL), own(0.0), 0.0)
     P = np.diag([0.01] * 3 + [std**2] * 3 + [9.0] * 3)
     track = Track(1, Gaussian(np.array([*place, *velocity, 0, 0, 0]), P), 10.0)
-    assert standing.holds(track) is expected
+    assert static_clutter.holds(track) is expected
 
 
 def test_a_wall_stands_still_for_a_passive_terminal():
@@ -145,9 +150,9 @@ def test_a_wall_stands_still_for_a_passive_terminal():
     ) / far[1]
     d = seen(0.0, places)
     d = Detections(**{**vars(d), "range": far[0] + far[1], "velocity": rate})
-    standing = Standing(np.inf, None, PERIOD)
-    assert standing.look(d, own(0.0), 0.0, sender).tolist() == [True] * 5 + [False]
-    np.testing.assert_allclose(standing.state.echoes[:, 1:4], WALL, atol=1e-9)
+    static_clutter = StaticClutter(np.inf, None, PERIOD)
+    assert static_clutter.look(d, own(0.0), 0.0, sender).tolist() == [True] * 5 + [False]
+    np.testing.assert_allclose(static_clutter.state.echoes[:, 1:4], WALL, atol=1e-9)
 
 
 def test_a_young_track_that_an_echo_of_a_crowd_carries_on_is_none():
@@ -164,20 +169,20 @@ def test_a_young_track_that_an_echo_of_a_crowd_carries_on_is_none():
     tracks = [track(1, 0), track(2, 0), track(3, 1), track(4, 0, confirmed=False), track(5, -1)]
     tracker = Tracker(Tracking(), UNAMBIGUOUS)
     tracker.state.tracks = tracks
-    standing = Standing(1.71, None, PERIOD)
-    standing._crowd = np.array([True, False])
-    standing.prune(tracker, Own(own(0.0), 0.0, tentative=frozenset({1, 3, 4, 5})))
+    static_clutter = StaticClutter(1.71, None, PERIOD)
+    static_clutter._crowd = np.array([True, False])
+    static_clutter.prune(tracker, Own(own(0.0), 0.0, tentative=frozenset({1, 3, 4, 5})))
     assert [t.id for t in tracker.tracks] == [2, 3, 5]
 
 
 def test_two_uavs_that_hover_near_each_other_are_no_crowd():
     """10 m apart, thirty frames: each is one place beside the other, however often it is seen.
     Planted bug: every echo counted."""
-    standing = Standing(1.71, None, PERIOD)
+    static_clutter = StaticClutter(1.71, None, PERIOD)
     for frame in range(30):
         time = 0.03 * frame
         d = seen(time, [(8.0, 24.0, 4.0), (-1.7, 27.0, 6.0)])
-        assert not standing.look(d, own(time), time).any()
+        assert not static_clutter.look(d, own(time), time).any()
 
 
 def above(d: Detections, snr: list[float]) -> Detections:
@@ -189,11 +194,11 @@ def test_a_uav_that_stands_out_of_a_wall_by_ten_decibels_is_none_of_it(snr, crow
     """Hovering before five places of a wall at 40; the wall stays one, and a track at the UAV's
     place is held to the same. Planted bugs: strength ignored; the wall's echoes spared too."""
     place = (0.0, 28.0, 6.0)
-    standing = Standing(1.71, None, PERIOD)
-    found = standing.look(above(seen(0.0, [*WALL, place]), [40.0] * 5 + [snr]), own(0.0), 0.0)
+    static_clutter = StaticClutter(1.71, None, PERIOD)
+    found = static_clutter.look(above(seen(0.0, [*WALL, place]), [40.0] * 5 + [snr]), own(0.0), 0.0)
     assert found.tolist() == [True] * 5 + [crowd]
     state = Gaussian(np.array([*place, *np.zeros(6)]), np.diag([0.01] * 3 + [0.09] * 3 + [9.0] * 3))
-    assert standing.holds(Track(1, state, snr)) is crowd
+    assert static_clutter.holds(Track(1, state, snr)) is crowd
 
 
 @pytest.mark.parametrize(("snr", "crowd"), [(390.0, True), (410.0, False)])
@@ -202,7 +207,7 @@ def test_what_stands_out_by_ten_decibels_makes_no_crowd_of_the_weaker(snr, crowd
     of which the brightest is no part of a surface that the UAV could be of. Planted bug: the
     strength of those beside it ignored."""
     places = [(0.0, 28.0, 6.0), (-4.0, 29.0, 7.0), (3.0, 30.0, 9.0), (-2.0, 24.0, 4.0)]
-    found = Standing(1.71, None, PERIOD).look(
+    found = StaticClutter(1.71, None, PERIOD).look(
         above(seen(0.0, places), [40.0, 40.0, 40.0, snr]), own(0.0), 0.0
     )
     assert found[:3].tolist() == [crowd] * 3
@@ -216,16 +221,16 @@ def test_what_touches_the_mesh_does_not_stand_out(height, crowd):
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     ground = CityMesh("ground", corners, faces, np.zeros(2, np.int16), (), np.zeros(3))
     d = above(seen(0.0, [*WALL, (0.0, 28.0, height)]), [40.0] * 5 + [4000.0])
-    found = Standing(1.71, Walls(ground), PERIOD).look(d, own(0.0), 0.0)
+    found = StaticClutter(1.71, Walls(ground), PERIOD).look(d, own(0.0), 0.0)
     assert found.tolist() == [True] * 5 + [crowd]
 
 
 def test_a_line_of_sight_is_no_echo():
     """Planted bug: a passive terminal's reference remembered."""
-    standing = Standing(1.71, None, PERIOD)
+    static_clutter = StaticClutter(1.71, None, PERIOD)
     d = seen(0.0, WALL)
-    standing.look(Detections(**{**vars(d), "is_reference": np.ones(5, bool)}), own(0.0), 0.0)
-    assert len(standing.state.echoes) == 0
+    static_clutter.look(Detections(**{**vars(d), "is_reference": np.ones(5, bool)}), own(0.0), 0.0)
+    assert len(static_clutter.state.echoes) == 0
 
 
 def ground() -> Walls:
@@ -249,12 +254,12 @@ def test_what_stands_still_on_a_face_is_the_face(height, velocity, std, expected
     """One echo alone, 30 m away; it is remembered as others are, for a wall that the mesh lacks
     stands beside. Planted bugs: the mesh not asked; deviations left out; any place taken for a
     face; the rate not held against the flight."""
-    standing = Standing(1.71, ground(), PERIOD)
+    static_clutter = StaticClutter(1.71, ground(), PERIOD)
     d = seen(0.0, [(0.0, 30.0, height)], [velocity])
     d = Detections(**{**vars(d), "std": np.array([[0.01, 0.01, std, std]])})
-    assert standing.look(d, own(0.0), 0.0).tolist() == [expected]
+    assert static_clutter.look(d, own(0.0), 0.0).tolist() == [expected]
     if expected:
-        assert len(standing.state.echoes) == 1
+        assert len(static_clutter.state.echoes) == 1
 
 
 @pytest.mark.parametrize(
@@ -272,5 +277,5 @@ def test_no_uav_flies_in_a_face(height, velocity, std, expected):
     Planted bugs: speed not asked; deviations added for those that fly."""
     P = np.diag([std**2] * 3 + [0.09] * 3 + [9.0] * 3)
     track = Track(1, Gaussian(np.array([0.0, 30.0, height, *velocity, 0, 0, 0]), P), 10.0)
-    assert Standing(1.71, ground(), PERIOD).holds(track) is expected
-    assert not Standing(1.71, None, PERIOD).holds(track)
+    assert StaticClutter(1.71, ground(), PERIOD).holds(track) is expected
+    assert not StaticClutter(1.71, None, PERIOD).holds(track)

@@ -17,9 +17,9 @@ from isac_rt.extensions.cooperation.fusion import (
     DATUM_STD,
     ERRORS,
     OWN_NOISE,
-    Picture,
+    FusedTracks,
     Report,
-    Told,
+    Reported,
     _intersected,
     advance,
     at_once,
@@ -27,7 +27,7 @@ from isac_rt.extensions.cooperation.fusion import (
     in_world,
     intersection,
     intersection_of,
-    its_word,
+    report_of,
     together,
 )
 from isac_rt.track.filter import Gaussian, bistatic_distance, predict
@@ -104,7 +104,7 @@ def test_the_same_words_heard_again_count_once():
     assert np.allclose(again.covariance, a.covariance, rtol=1e-9)
 
 
-def told(key, mean, variances, time=0.0, since=0.0, name=None):
+def reported_to(key, mean, variances, time=0.0, since=0.0, name=None):
     state = Gaussian(np.array(mean, float), np.diag(np.array(variances, float)))
     key = Key(*key)
     return Report(key, since, name or Name(since, *key), time, state)
@@ -116,33 +116,33 @@ def test_two_terminals_that_see_from_two_sides_fix_a_body():
     lies where the sure axes cross, up to the weight of the unsure ones: 0.01 / 4.01 of 1.3 m."""
     fine, coarse = 0.01, 4.0
     rest = [0.04, 0.09, 0.09, 0.09]
-    south = told(("S->S", 4), [31.3, 20.0, 12, 1, 2, 0], [coarse, fine, *rest])
-    west = told(("S->W", 7), [30.0, 21.3, 12, 1, 2, 0], [fine, coarse, *rest])
-    (body,) = Picture().update([south, west])
-    assert set(body.members) == {south.key, west.key}
+    south = reported_to(("S->S", 4), [31.3, 20.0, 12, 1, 2, 0], [coarse, fine, *rest])
+    west = reported_to(("S->W", 7), [30.0, 21.3, 12, 1, 2, 0], [fine, coarse, *rest])
+    (uav,) = FusedTracks().update([south, west])
+    assert set(uav.members) == {south.key, west.key}
     variance = 2 / (1 / fine + 1 / coarse)
     alike = np.repeat(np.square(DATUM_STD), 3)  # what both are wrong alike
-    found = np.diag(body.state.covariance) - alike
+    found = np.diag(uav.state.covariance) - alike
     assert np.allclose(found, [variance, variance, *rest], rtol=1e-6)
     off = 1.3 * fine / (fine + coarse)
-    assert np.allclose(body.state.mean, [30 + off, 20 + off, 12, 1, 2, 0], atol=1e-6)
+    assert np.allclose(uav.state.mean, [30 + off, 20 + off, 12, 1, 2, 0], atol=1e-6)
 
 
 def test_bodies_farther_apart_than_their_errors_stay_two():
-    a = told(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.01] * 6)
-    b = told(("A->B", 1), [31, 20, 12, 1, 2, 0], [0.01] * 6)
-    assert len(Picture().update([a, b])) == 2
+    a = reported_to(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.01] * 6)
+    b = reported_to(("A->B", 1), [31, 20, 12, 1, 2, 0], [0.01] * 6)
+    assert len(FusedTracks().update([a, b])) == 2
 
 
 def test_a_track_that_could_be_anything_does_not_take_the_place_of_a_sure_one():
     """Both lie within the gate, the vague one at the lesser Mahalanobis distance. Its likelihood is
     far less. Planted bug: the determinant left out."""
-    body = told(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.01] * 6)
-    near = told(("A->B", 1), [30.2, 20, 12, 1, 2, 0], [0.01] * 6)
-    vague = told(("A->B", 2), [33, 20, 12, 1, 2, 0], [25.0] * 6)
-    found = Picture().update([body, near, vague])
+    uav = reported_to(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.01] * 6)
+    near = reported_to(("A->B", 1), [30.2, 20, 12, 1, 2, 0], [0.01] * 6)
+    vague = reported_to(("A->B", 2), [33, 20, 12, 1, 2, 0], [25.0] * 6)
+    found = FusedTracks().update([uav, near, vague])
     assert {frozenset(f.members) for f in found} == {
-        frozenset({body.key, near.key}),
+        frozenset({uav.key, near.key}),
         frozenset({vague.key}),
     }
 
@@ -151,30 +151,30 @@ def test_two_tracks_of_one_terminal_are_two_bodies_unless_uavs_cannot_be_so_near
     """With errors that would let each of them be the other: 0.6 m apart they are two UAVs, 0.4 m
     apart one, which is parted again over 1 m. A track of another terminal changes nothing. Planted
     bugs: one only if a single terminal sees them; never parted."""
-    a = told(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.2] * 6)
-    other = told(("A->B", 1), [30, 20, 12, 1, 2, 0], [0.2] * 6)
+    a = reported_to(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.2] * 6)
+    other = reported_to(("A->B", 1), [30, 20, 12, 1, 2, 0], [0.2] * 6)
 
     def beside(offset):
-        return told(("A->A", 2), [30 + offset, 20, 12, 1, 2, 0], [0.2] * 6)
+        return reported_to(("A->A", 2), [30 + offset, 20, 12, 1, 2, 0], [0.2] * 6)
 
-    assert len(Picture().update([a, beside(0.6)])) == 2
+    assert len(FusedTracks().update([a, beside(0.6)])) == 2
     for more in ([], [other]):
-        picture = Picture()
-        (body,) = picture.update([a, beside(0.4), *more])
-        assert len(body.members) == 2 + len(more)
-        assert len(picture.update([a, beside(0.9), *more])) == 1
-        assert len(picture.update([a, beside(1.1), *more])) == 2
+        fused_tracks = FusedTracks()
+        (uav,) = fused_tracks.update([a, beside(0.4), *more])
+        assert len(uav.members) == 2 + len(more)
+        assert len(fused_tracks.update([a, beside(0.9), *more])) == 1
+        assert len(fused_tracks.update([a, beside(1.1), *more])) == 2
 
 
 def test_a_pair_is_parted_later_than_it_would_be_joined():
     """chi squared of six: 16.8 at 0.99, 38.3 at 1 - 1e-6. With variances of 0.01 each an offset d
     has d^2 / 0.02: 0.7 m is 24.5, which joins nobody and parts nobody, 0.9 m is 40.5."""
-    a = told(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.01] * 6)
+    a = reported_to(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.01] * 6)
 
     def other(offset):
-        return told(("A->B", 1), [30 + offset, 20, 12, 1, 2, 0], [0.01] * 6)
+        return reported_to(("A->B", 1), [30 + offset, 20, 12, 1, 2, 0], [0.01] * 6)
 
-    apart, together = Picture(), Picture()
+    apart, together = FusedTracks(), FusedTracks()
     assert len(apart.update([a, other(0.7)])) == 2
     assert len(together.update([a, other(0.1)])) == 1
     assert len(together.update([a, other(0.7)])) == 1
@@ -185,27 +185,27 @@ def test_all_who_hear_of_the_earliest_track_call_the_body_by_it():
     """One listener hears the earlier track first, one the later one; a third comes after the
     earlier one has ended and has the name from who says the later one. Planted bug: the name of
     the first heard."""
-    early = told(("A->A", 9), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.0)
-    late = told(("A->B", 2), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5)
-    first, second = Picture(), Picture()
+    early = reported_to(("A->A", 9), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.0)
+    late = reported_to(("A->B", 2), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5)
+    first, second = FusedTracks(), FusedTracks()
     first.update([early])
     second.update([late])
-    for picture in (first, second):
-        (body,) = picture.update([early, late])
-        assert body.name == Name(1.0, "A->A", 9)
-        (body,) = picture.update([late])
-        assert body.name == Name(1.0, "A->A", 9)
-    heard = told(("A->B", 2), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5, name=body.name)
-    (body,) = Picture().update([heard])
-    assert body.name == Name(1.0, "A->A", 9)
+    for fused_tracks in (first, second):
+        (uav,) = fused_tracks.update([early, late])
+        assert uav.name == Name(1.0, "A->A", 9)
+        (uav,) = fused_tracks.update([late])
+        assert uav.name == Name(1.0, "A->A", 9)
+    received = reported_to(("A->B", 2), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5, name=uav.name)
+    (uav,) = FusedTracks().update([received])
+    assert uav.name == Name(1.0, "A->A", 9)
 
 
 def test_no_two_bodies_have_one_name():
     """A track that was part of a body leaves it and still brings the name along."""
     name = Name(1.0, "A->A", 9)
-    early = told(("A->A", 9), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.0)
-    away = told(("A->B", 2), [40, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5, name=name)
-    found = Picture().update([away, early])
+    early = reported_to(("A->A", 9), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.0)
+    away = reported_to(("A->B", 2), [40, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5, name=name)
+    found = FusedTracks().update([away, early])
     assert {f.members[0]: f.name for f in found} == {
         early.key: name,
         away.key: Name(1.5, "A->B", 2),
@@ -218,23 +218,23 @@ def test_a_name_goes_back_to_the_body_with_its_track(order):
     own track, by which the third is known meanwhile. That one had it too before."""
     a, b, c = Key("S->A", 1), Key("S->B", 1), Key("S->C", 1)
     known = {a: Name(0.0, *a), b: Name(0.0, *a), c: Name(1.0, *b)}
-    bodies = [{"name": list(known[key]), "members": [list(key)]} for key in (a, b, c)]
-    picture = Picture()
-    picture.restore({"state": {"bodies": [bodies[i] for i in order]}})
+    uavs = [{"name": list(known[key]), "members": [list(key)]} for key in (a, b, c)]
+    fused_tracks = FusedTracks()
+    fused_tracks.restore({"state": {"uavs": [uavs[i] for i in order]}})
     reports = [
-        told(key, [50.0 * i, 0, 0, 0, 0, 0], [0.1] * 6, since=float(i), name=known[key])
+        reported_to(key, [50.0 * i, 0, 0, 0, 0, 0], [0.1] * 6, since=float(i), name=known[key])
         for i, key in enumerate((a, b, c))
     ]
-    names = {body.members[0]: body.name for body in picture.update(reports)}
+    names = {uav.members[0]: uav.name for uav in fused_tracks.update(reports)}
     assert names == {a: Name(0.0, *a), b: Name(1.0, *b), c: Name(2.0, *c)}
 
 
 def test_a_terminal_is_known_by_what_it_says_of_itself():
     """The nearer in likelihood of two bodies; the other one stays a stranger."""
     itself = Gaussian(np.array([30.0, 20, 12, 1, 2, 0]), 0.0025 * np.eye(6))
-    echo = told(("A->A", 1), [30.05, 20, 12, 1, 2, 0], [0.04] * 6)
-    beside = told(("A->A", 2), [30.6, 20, 12, 1, 2, 0], [0.04] * 6)
-    found = Picture().update([beside, echo], {"P": its_word(itself)})
+    echo = reported_to(("A->A", 1), [30.05, 20, 12, 1, 2, 0], [0.04] * 6)
+    beside = reported_to(("A->A", 2), [30.6, 20, 12, 1, 2, 0], [0.04] * 6)
+    found = FusedTracks().update([beside, echo], {"P": report_of(itself)})
     assert {f.members[0]: f.terminal for f in found} == {echo.key: "P", beside.key: None}
 
 
@@ -257,7 +257,7 @@ def test_reports_are_brought_to_one_time():
     the lever of a place without that of its motion; the state of before in the whole."""
     rng = np.random.default_rng(21)
     told_of = [
-        Told(Gaussian(rng.normal(size=6), covariance(rng)), rng.normal(size=(6, ERRORS)))
+        Reported(Gaussian(rng.normal(size=6), covariance(rng)), rng.normal(size=(6, ERRORS)))
         for _ in range(3)
     ]
     reports = [
@@ -265,7 +265,7 @@ def test_reports_are_brought_to_one_time():
         for k, time in enumerate((0.3, 0.7, 0.41))
     ]
     for report, before in zip(at_once(reports, 0.7, 1.5), reports, strict=True):
-        alone = Told(before.state, before.lever).after(0.7 - before.time, 1.5)
+        alone = Reported(before.state, before.lever).after(0.7 - before.time, 1.5)
         assert (report.key, report.name, report.time) == (before.key, before.name, 0.7)
         assert np.allclose(report.state.mean, alone.state.mean, rtol=1e-12)
         assert np.allclose(report.state.covariance, alone.state.covariance, rtol=1e-12)
@@ -319,14 +319,14 @@ def test_what_is_told_holds_the_errors_of_who_tells():
     at 40 m are 0.209 m. What is told apart from them is the track's own. Planted bugs: the attitude
     along the line of sight; no clock; the clock on all axes."""
     tracks = tracked([0.0, 40.0, 0.0, 1.0, 2.0, 3.0])
-    said = in_world(tracks, 0, Pose.at_rest((5.0, -3.0, 20.0)), clock_std=0.3)
-    assert np.allclose(said.state.mean, [5, 37, 20, 1, 2, 3])
-    assert np.array_equal(said.state.covariance, tracks.covariance[0])
-    report = Report(Key("A->B", 0), 0.0, Name(0.0, "A->B", 0), 0.0, *said)
+    report_ = in_world(tracks, 0, Pose.at_rest((5.0, -3.0, 20.0)), clock_std=0.3)
+    assert np.allclose(report_.state.mean, [5, 37, 20, 1, 2, 3])
+    assert np.array_equal(report_.state.covariance, tracks.covariance[0])
+    report = Report(Key("A->B", 0), 0.0, Name(0.0, "A->B", 0), 0.0, *report_)
     across, pose, clock = (40 * ATTITUDE_STD) ** 2, POSE_STD[0] ** 2, 0.09
     assert across == pytest.approx(0.209**2, rel=5e-3)
     assert np.allclose(
-        np.diag(report.whole.covariance - said.state.covariance)[:3],
+        np.diag(report.whole.covariance - report_.state.covariance)[:3],
         [across + pose, pose + clock, across + pose],
     )
     (later,) = at_once([report], 0.2, 1.0)
@@ -340,11 +340,11 @@ def test_a_lever_is_what_an_error_does():
     deviation. Planted bugs: the turn the other way round; a turn of place alone; the clock on the
     reflector's path alone."""
     own = Pose(np.array([5.0, -3.0, 20.0]), np.array([2.0, 1.0, 0.5]), np.zeros(3), np.eye(3))
-    body, sender = np.array([11.0, 31.0, -4.0, 3.0, -2.0, 1.0]), np.array([-20.0, 25.0, 2.0])
-    tracks = tracked([*sender, 0, 0, 0], body, reference=0)
-    said, lever = in_world(tracks, 1, own, clock_std=0.3)
-    rho, d = np.linalg.norm(body[:3]), np.linalg.norm(sender)
-    u, length = body[:3] / rho, rho + np.linalg.norm(body[:3] - sender)
+    uav, sender = np.array([11.0, 31.0, -4.0, 3.0, -2.0, 1.0]), np.array([-20.0, 25.0, 2.0])
+    tracks = tracked([*sender, 0, 0, 0], uav, reference=0)
+    report_, lever = in_world(tracks, 1, own, clock_std=0.3)
+    rho, d = np.linalg.norm(uav[:3]), np.linalg.norm(sender)
+    u, length = uav[:3] / rho, rho + np.linalg.norm(uav[:3] - sender)
     deviations = np.array([*np.repeat(POSE_STD, 3), *[ATTITUDE_STD] * 3, 0.3])
     step = 1e-3
     for k, deviation in enumerate(deviations):
@@ -353,8 +353,8 @@ def test_a_lever_is_what_an_error_does():
         turn = Rotation.from_rotvec(e[6:9]).as_matrix()
         far = bistatic_distance(length + e[9], sender * (d + e[9]) / d, u)
         place = own.position + e[:3] + turn @ (u * far)
-        motion = own.velocity + e[3:6] + turn @ body[3:]
-        moved = (np.concatenate([place, motion]) - said.mean) / step
+        motion = own.velocity + e[3:6] + turn @ uav[3:]
+        moved = (np.concatenate([place, motion]) - report_.mean) / step
         assert moved == pytest.approx(lever[:, k], abs=1e-5 + 1e-3 * deviation), k
 
 
@@ -366,11 +366,11 @@ def test_what_the_line_of_sight_pulls_is_unsure_along_its_direction(beside, pull
     bugs: the direction to the transmitter; the way pulled with its reference, as by a clock; pulled
     however far it is."""
     own, sender = Pose.at_rest((5.0, -3.0, 20.0)), np.array([0.0, 40.0, 0.0])
-    body = np.array([beside, 20.0, 0.0, 3.0, -2.0, 1.0])
-    tracks = tracked([*sender, 0, 0, 0], body, reference=0)
+    uav = np.array([beside, 20.0, 0.0, 3.0, -2.0, 1.0])
+    tracks = tracked([*sender, 0, 0, 0], uav, reference=0)
     more = in_world(tracks, 1, own, cell=0.47).state.covariance - tracks.covariance[1]
-    rho = np.linalg.norm(body[:3])
-    length, u = rho + np.linalg.norm(body[:3] - sender), body[:3] / rho
+    rho = np.linalg.norm(uav[:3])
+    length, u = rho + np.linalg.norm(uav[:3] - sender), uav[:3] / rho
     step = 1e-5
     moved = (bistatic_distance(length + step, sender, u) - rho) / step * 0.5 * 0.47 * u
     expected = np.zeros((6, 6))
@@ -388,23 +388,25 @@ def test_a_body_on_the_line_of_sight_is_told_with_nothing_known_along_it(aside):
     the limit of the geometry. Planted bugs: a division by nothing on the line, of a pull and of a
     clock."""
     turn = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
-    sender, body = turn @ [0.0, 39.0, 0.0], turn @ [aside, 13.0, 0.0]
-    tracks = tracked([*sender, 0, 0, 0], [*body, 0, 0, 0], reference=0)
+    sender, uav = turn @ [0.0, 39.0, 0.0], turn @ [aside, 13.0, 0.0]
+    tracks = tracked([*sender, 0, 0, 0], [*uav, 0, 0, 0], reference=0)
     own = Pose.at_rest((5.0, -3.0, 20.0))
-    told = in_world(tracks, 1, own, clock_std=1.0, cell=0.47)
-    P, own_P = (turn.T @ C[:3, :3] @ turn for C in (told.state.covariance, tracks.covariance[1]))
+    reported_to = in_world(tracks, 1, own, clock_std=1.0, cell=0.47)
+    P, own_P = (
+        turn.T @ C[:3, :3] @ turn for C in (reported_to.state.covariance, tracks.covariance[1])
+    )
     assert P[1, 1] > 100**2
     assert P[2, 2] == pytest.approx(own_P[2, 2], abs=1e-3)  # rounding of (200 km)^2 is 1e-5
-    assert turn.T @ told.lever[:3, 9] == pytest.approx([0, 1 / 9, 0], abs=1e-3)
-    seen = Gaussian(told.state.mean + 0.01, 0.01 * np.eye(6))
+    assert turn.T @ reported_to.lever[:3, 9] == pytest.approx([0, 1 / 9, 0], abs=1e-3)
+    seen = Gaussian(reported_to.state.mean + 0.01, 0.01 * np.eye(6))
     reports = [
         Report(Key(origin, 1), 0.0, Name(0.0, origin, 1), 0.0, state, lever)
         for origin, state, lever in (
-            ("A->B", told.state, told.lever),
+            ("A->B", reported_to.state, reported_to.lever),
             ("A->A", seen, np.zeros((6, ERRORS))),
         )
     ]
-    (one,) = Picture().update(reports)
+    (one,) = FusedTracks().update(reports)
     assert np.abs(one.state.mean - seen.mean).max() < 0.1
 
 
@@ -424,7 +426,7 @@ def test_what_one_body_shows_of_a_terminal_helps_the_others():
     mean, other = rng.normal(size=6), rng.normal(size=6)
     one, two = levered(("A->A", 1), mean, P1, rng), levered(("A->A", 2), other, P2, rng)
     itself = of_itself(Pose(mean[:3] + 0.2, mean[3:] - 0.1, np.zeros(3), np.eye(3)))
-    found = together([[one], [two]], {0: ("T", its_word(itself))})
+    found = together([[one], [two]], {0: ("T", report_of(itself))})
     L1, L2 = one.lever, two.lever
     S = L1 @ L1.T + P1 + itself.covariance + OWN_NOISE**2 * np.eye(6)
     C = np.eye(ERRORS) - L1.T @ np.linalg.solve(S, L1)
@@ -446,7 +448,7 @@ def test_a_picture_is_the_solution_of_its_normal_equations(seed):
     place of taken off."""
     rng = np.random.default_rng([23, seed])
     told_by = [("A->A", "S->A", "A->B"), ("A->A",), ("S->A", "A->B"), ("A->A", "A->B"), ("A->B",)]
-    bodies = [
+    uavs = [
         [
             replace(
                 levered((origin, k), rng.normal(size=6), 0.1 * covariance(rng), rng),
@@ -457,12 +459,12 @@ def test_a_picture_is_the_solution_of_its_normal_equations(seed):
         for k, origins in enumerate(told_by)
     ]
     words = {
-        name: its_word(Gaussian(rng.normal(size=6), np.eye(6))).after(0.3, 2.0)
+        name: report_of(Gaussian(rng.normal(size=6), np.eye(6))).after(0.3, 2.0)
         for name in ("B", "T")
     }
-    found = together(bodies, {1: ("B", words["B"]), 4: ("T", words["T"])})
+    found = together(uavs, {1: ("B", words["B"]), 4: ("T", words["T"])})
 
-    unknown = [("body", k, i) for k in range(len(bodies)) for i in range(6)]
+    unknown = [("body", k, i) for k in range(len(uavs)) for i in range(6)]
     unknown += [("pose", name, i) for name in "ABT" for i in range(ERRORS - 1)]
     unknown += [("clock", link) for link in ("A->A", "S->A", "A->B")]
     number = {what: n for n, what in enumerate(unknown)}
@@ -482,7 +484,7 @@ def test_a_picture_is_the_solution_of_its_normal_equations(seed):
         information[:] += A.T @ inverse @ A
         vector[:] += A.T @ inverse @ state.mean
 
-    for k, reports in enumerate(bodies):
+    for k, reports in enumerate(uavs):
         for report, w in zip(reports, _intersected([r.whole for r in reports])[1], strict=True):
             origin = report.key.origin
             add(k, origin[-1], origin, report.state, report.lever, w)
@@ -490,11 +492,11 @@ def test_a_picture_is_the_solution_of_its_normal_equations(seed):
         add(k, name, None, *words[name], 1.0)
     C = np.linalg.inv(information)
     mean, spread = C @ vector, np.sqrt(np.diag(C))
-    for k, body in enumerate(found):
+    for k, uav in enumerate(found):
         rows = slice(6 * k, 6 * k + 6)
-        off = (body.covariance - C[rows, rows]) / np.outer(spread[rows], spread[rows])
+        off = (uav.covariance - C[rows, rows]) / np.outer(spread[rows], spread[rows])
         assert np.abs(off).max() < 1e-8  # rounding, of a conditioning of 1e6
-        assert np.abs((body.mean - mean[rows]) / spread[rows]).max() < 1e-7
+        assert np.abs((uav.mean - mean[rows]) / spread[rows]).max() < 1e-7
 
 
 @pytest.mark.parametrize("acceleration", [0.1, 3.0])
@@ -512,7 +514,7 @@ def test_a_word_of_some_time_ago_has_the_errors_of_then_carried_on(acceleration)
         for o, P, of in (("A->A", P1, np.zeros((6, ERRORS))), ("T->T", P2, lever))
     )
     itself = Gaussian(0.1 * rng.normal(size=6), D**2)
-    word = its_word(itself).after(age, acceleration)
+    word = report_of(itself).after(age, acceleration)
     found = together([[of_t], [of_stranger]], {0: ("T", word)})
 
     carry = np.kron([[1, age], [0, 1]], np.eye(3))
@@ -541,10 +543,10 @@ def test_errors_of_terminals_are_told_apart_whatever_else_is_common(seed):
     levers = [[0.3 * rng.normal(size=(6, ERRORS)) for _ in range(3)] for _ in keys]
 
     def estimate(values):
-        bodies = []
+        uavs = []
         for j, joint in enumerate(joints):
             blocks = joint[:6, :6], joint[6:, 6:]
-            bodies.append(
+            uavs.append(
                 [
                     Report(
                         Key(origin, j),
@@ -557,7 +559,7 @@ def test_errors_of_terminals_are_told_apart_whatever_else_is_common(seed):
                     for t, origin in enumerate(keys)
                 ]
             )
-        return together(bodies, {})
+        return together(uavs, {})
 
     nothing = np.zeros((2, 3, 6))
     stated = estimate(nothing)
@@ -565,30 +567,30 @@ def test_errors_of_terminals_are_told_apart_whatever_else_is_common(seed):
     for place in np.ndindex(2, 3, 6):
         values = nothing.copy()
         values[place] = 1.0
-        for j, body in enumerate(estimate(values)):
-            gains[(j, slice(None), *place)] = body.mean
+        for j, uav in enumerate(estimate(values)):
+            gains[(j, slice(None), *place)] = uav.mean
     errors = np.zeros((2, 3, 6, 2, 3, 6))
     for t in range(2):
         common = np.stack(levers[t]).reshape(18, ERRORS)
         errors[t, :, :, t] = (common @ common.T).reshape(3, 6, 3, 6)
     for j, joint in enumerate(joints):
         errors[:, j, :, :, j] += joint.reshape(2, 6, 2, 6)
-    for j, body in enumerate(stated):
+    for j, uav in enumerate(stated):
         G = gains[j].reshape(6, 36)
         true = G @ errors.reshape(36, 36) @ G.T
-        spread = np.sqrt(np.diag(body.covariance))
-        least = np.linalg.eigvalsh((body.covariance - true) / np.outer(spread, spread)).min()
+        spread = np.sqrt(np.diag(uav.covariance))
+        least = np.linalg.eigvalsh((uav.covariance - true) / np.outer(spread, spread)).min()
         assert least > -1e-8  # rounding
 
 
 def test_a_lone_track_takes_its_old_name_along():
     """B's track was A's body, which A has lost; another one finds it again. Planted bug: the name
     left behind when bodies join."""
-    early = told(("A->C", 9), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.0)
-    late = told(("A->A", 2), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5)
-    newest = told(("A->B", 7), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=3.0)
-    picture = Picture()
-    picture.update([early, late])
-    picture.update([late])
-    (body,) = picture.update([late, newest])
-    assert body.name == Name(1.0, "A->C", 9)
+    early = reported_to(("A->C", 9), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.0)
+    late = reported_to(("A->A", 2), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5)
+    newest = reported_to(("A->B", 7), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=3.0)
+    fused_tracks = FusedTracks()
+    fused_tracks.update([early, late])
+    fused_tracks.update([late])
+    (uav,) = fused_tracks.update([late, newest])
+    assert uav.name == Name(1.0, "A->C", 9)

@@ -7,20 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isac_rt.extensions.cooperation.fusion import DATUM_STD, ERRORS, Told
+from isac_rt.extensions.cooperation.centralised import CentralisedTracker, Scan, TrackManagement
+from isac_rt.extensions.cooperation.fusion import DATUM_STD, ERRORS, Reported
 from isac_rt.extensions.cooperation.messages import (
     DETECTION_BITS,
     HEADER_BITS,
     HOLD_S,
-    LOOK_BITS,
     NUMBER_BITS,
     REPORT_BITS,
+    SCAN_BITS,
     TERMINAL_BITS,
     Channel,
     Notes,
     Sightings,
 )
-from isac_rt.extensions.cooperation.pool import Lives, Look, PooledTracker
 from isac_rt.plain import plain
 from isac_rt.storage import pack, unpack
 from isac_rt.track.filter import Ambiguity, Gaussian
@@ -37,7 +37,7 @@ def state(x=30.0, variance=0.01):
 
 def seen(notes, time, *numbers, origin="A->A", variance=0.01):
     lever = np.zeros((6, ERRORS))
-    notes.see(origin, time, {n: Told(state(30 + 5 * n, variance), lever) for n in numbers})
+    notes.see(origin, time, {n: Reported(state(30 + 5 * n, variance), lever) for n in numbers})
     notes.stand(time, state(0.0))
     return notes
 
@@ -98,14 +98,14 @@ def test_a_message_comes_late_with_the_last_of_its_frames_that_is_read():
 
 def test_tracks_take_turns_where_a_frame_cannot_hold_all():
     """Seven tracks, room for two in a frame of 1300 bits: 64 + 136 + 7 x 16 = 312 and 2 x 424."""
-    notes, said = Notes("A"), []
+    notes, report_ = Notes("A"), []
     for frame in range(8):
         seen(notes, T * frame, *range(7))
         words = notes.compose("B", 1300)
         assert words.bits <= 1300
-        said.append([r.key.number for r in words.reports])
-    assert said[:3] == [[0, 1], [2, 3], [4, 5]]
-    counts = np.bincount(np.concatenate(said), minlength=7)
+        report_.append([r.key.number for r in words.reports])
+    assert report_[:3] == [[0, 1], [2, 3], [4, 5]]
+    counts = np.bincount(np.concatenate(report_), minlength=7)
     assert counts.min() == 2 and counts.max() == 3
     assert notes.compose("C", 1300).reports[0].key.number == 0  # another listener's turn
 
@@ -120,25 +120,25 @@ def test_what_is_heard_is_as_old_as_it_is_and_ends_when_it_is_too_old():
     """Told after frame 0 and heard with frame 1, it stands still where it was, 0.05 s old; nothing
     more comes, and after half a second it is gone."""
     a, b = seen(Notes("A"), 0.0, 1), Notes("B")
-    b.hear(a.compose("B", 10**4))
-    (body,) = b.look(T, 1.5)
-    assert body.state.mean[0] == pytest.approx(35.0)
+    b.receive(a.compose("B", 10**4))
+    (uav,) = b.fuse(T, 1.5)
+    assert uav.state.mean[0] == pytest.approx(35.0)
     # 0.01 (1 + 0.05^2) and the acceleration: 1.5^2 0.05^4 / 4, but for the drift of Singer's model;
     # and what all terminals are wrong alike
-    assert body.state.covariance[0, 0] == pytest.approx(
+    assert uav.state.covariance[0, 0] == pytest.approx(
         0.01 * (1 + T**2) + 1.5**2 * T**4 / 4 + DATUM_STD[0] ** 2, rel=1e-5
     )
-    assert len(b.look(HOLD_S, 1.5)) == 1
-    assert len(b.look(HOLD_S + 1e-3, 1.5)) == 0
+    assert len(b.fuse(HOLD_S, 1.5)) == 1
+    assert len(b.fuse(HOLD_S + 1e-3, 1.5)) == 0
 
 
 def test_a_track_that_its_terminal_has_dropped_ends_when_that_is_heard():
     a, b = seen(Notes("A"), 0.0, 1, 2), Notes("B")
-    b.hear(a.compose("B", 10**4))
+    b.receive(a.compose("B", 10**4))
     seen(a, T, 2)
-    assert len(b.look(T, 1.5)) == 2
-    b.hear(a.compose("B", 10**4))
-    assert [f.members for f in b.look(2 * T, 1.5)] == [(Key("A->A", 2),)]
+    assert len(b.fuse(T, 1.5)) == 2
+    b.receive(a.compose("B", 10**4))
+    assert [f.members for f in b.fuse(2 * T, 1.5)] == [(Key("A->A", 2),)]
 
 
 def test_words_that_come_back_make_nothing_surer():
@@ -157,12 +157,12 @@ def test_words_that_come_back_make_nothing_surer():
         assert not words["B", "A"].reports
         assert not words["C", "B"].reports
         for (_, listener), message in words.items():
-            {"A": a, "B": b, "C": c}[listener].hear(message)
+            {"A": a, "B": b, "C": c}[listener].receive(message)
         for notes in (a, b, c):
-            for body in notes.look(T * frame, 1.5):
-                assert body.members == (Key("A->A", 1),)
-                assert np.diag(body.state.covariance).min() >= 0.04 - 1e-12
-    assert len(c.look(T * 19, 1.5)) == 1
+            for uav in notes.fuse(T * frame, 1.5):
+                assert uav.members == (Key("A->A", 1),)
+                assert np.diag(uav.state.covariance).min() >= 0.04 - 1e-12
+    assert len(c.fuse(T * 19, 1.5)) == 1
 
 
 def test_a_message_brings_its_name_and_the_listener_its_older_one():
@@ -171,50 +171,50 @@ def test_a_message_brings_its_name_and_the_listener_its_older_one():
     seen(b, 0.0, 4, origin="A->B")
     seen(a, T, 4)
     seen(b, T, 4, origin="A->B")
-    a.look(T, 1.5)
-    a.hear(b.compose("A", 10**4))
-    (body,) = a.look(T, 1.5)
-    assert body.name[1:] == ("A->B", 4)
-    assert a.compose("C", 10**4).reports[0].name == body.name
+    a.fuse(T, 1.5)
+    a.receive(b.compose("A", 10**4))
+    (uav,) = a.fuse(T, 1.5)
+    assert uav.name[1:] == ("A->B", 4)
+    assert a.compose("C", 10**4).reports[0].name == uav.name
 
 
 def test_a_terminal_that_stops_in_mid_sentence_goes_on_with_it():
-    """Memory by way of the file's own form: notes, channel and picture. Planted bugs: `told` left
-    out; the bits that are left of a message."""
+    """Memory by way of the file's own form: notes, channel and fused tracks. Planted bugs:
+    `reported_to` left out; the bits that are left of a message."""
     a, b = seen(Notes("A"), 0.0, *range(7)), Notes("B")
-    b.hear(a.compose("B", 1300))
-    a.look(0.0, 1.5)
-    b.look(T, 1.5)
+    b.receive(a.compose("B", 1300))
+    a.fuse(0.0, 1.5)
+    b.fuse(T, 1.5)
     channel = Channel()
     channel.send(a.compose("B", 1300))
     channel.carry(0, 400, False)
     kept = unpack(*pack([a.memory(), b.memory(), channel.memory()]))
-    again, other, way = Notes("A"), Notes("B"), Channel()
-    for one, memory in zip((again, other, way), kept, strict=True):
+    again, other, direction = Notes("A"), Notes("B"), Channel()
+    for one, memory in zip((again, other, direction), kept, strict=True):
         one.restore(memory)
     for one, two in ((a, again), (b, other)):
-        said = [n.compose("X", 2000) for n in (one, two)] + [
+        report_ = [n.compose("X", 2000) for n in (one, two)] + [
             n.compose("B", 900) for n in (one, two)
         ]
-        packed = [pack(plain(m)) for m in said]
+        packed = [pack(plain(m)) for m in report_]
         assert packed[0] == packed[1] and packed[2] == packed[3]
-        assert said[0].reports and said[2].reports
+        assert report_[0].reports and report_[2].reports
         pictures = [
-            [(f.name, f.members, f.state.mean.tolist()) for f in n.look(2 * T, 1.5)]
+            [(f.name, f.members, f.state.mean.tolist()) for f in n.fuse(2 * T, 1.5)]
             for n in (one, two)
         ]
         assert pictures[0] == pictures[1]
-    outcomes = [[ch.carry(1 + i, 500, True) for i in range(2)] for ch in (channel, way)]
+    outcomes = [[ch.carry(1 + i, 500, True) for i in range(2)] for ch in (channel, direction)]
     assert [o is None for o in outcomes[0]] == [o is None for o in outcomes[1]] == [True, False]
     assert outcomes[1][1][1] is False
     waiting = Channel()
-    waiting.restore(unpack(*pack([way.memory()]))[0])
+    waiting.restore(unpack(*pack([direction.memory()]))[0])
     assert [m.bits for m in waiting.late(0)] == [outcomes[1][1][0].bits]
 
 
-def look(frame=0, origin="A->A", count=2, sure=None, snr=None):
+def scan(frame=0, origin="A->A", count=2, sure=None, snr=None):
     z = np.array([[30.0, 1, 0.1, 0.0], [40.0, 2, 0.2, 0.0], [50.0, 3, 0.3, 0.0]])[:count]
-    return Look(
+    return Scan(
         origin,
         frame,
         T * frame,
@@ -232,7 +232,7 @@ def look(frame=0, origin="A->A", count=2, sure=None, snr=None):
 
 def sightings(name):
     folds = Ambiguity(30.0), Ambiguity(60.0)
-    tracker = PooledTracker(("A", "B"), Tracking(), Lives(3, 5 * T, 0.36), folds)
+    tracker = CentralisedTracker(("A", "B"), Tracking(), TrackManagement(3, 5 * T, 0.36), folds)
     out = Sightings(name, tracker)
     out.stand(0.0, state(0.0))
     return out
@@ -244,58 +244,58 @@ def test_the_strongest_of_the_newest_go_first_and_what_does_not_fit_is_not_told_
     though it is weaker. After that nothing is new. Planted bugs: the oldest first; SNR before what
     is sure."""
     a = sightings("A")
-    a.see(look(0, count=2, sure=[False, True]))
-    a.see(look(1, count=3))
+    a.see(scan(0, count=2, sure=[False, True]))
+    a.see(scan(1, count=3))
     words = a.compose("B", 1400)
-    assert LOOK_BITS == 208 and DETECTION_BITS == 165
+    assert SCAN_BITS == 208 and DETECTION_BITS == 165
     assert words.bits == 64 + 136 + 2 * 208 + 5 * 16 + 4 * 165 <= 1400
-    assert [(x.frame, x.numbers.tolist()) for x in words.looks] == [(1, [0, 1, 2]), (0, [1])]
+    assert [(x.frame, x.numbers.tolist()) for x in words.scans] == [(1, [0, 1, 2]), (0, [1])]
     assert words.left_out == 1
-    assert not a.compose("B", 1300).looks
-    assert len(a.compose("C", 10**5).looks) == 2
+    assert not a.compose("B", 1300).scans
+    assert len(a.compose("C", 10**5).scans) == 2
 
 
 def test_a_channel_that_is_too_small_gets_one_detection_in_several_frames():
     """64 + 136 + 208 + 3 x 16 + 165 = 621 bits by 100 a frame: room for 700."""
     a = sightings("A")
-    a.see(look(0, count=3))
+    a.see(scan(0, count=3))
     words = a.compose("B", 100)
     assert words.bits == 621 and words.left_out == 2
-    assert words.looks[0].numbers.tolist() == [0]
+    assert words.scans[0].numbers.tolist() == [0]
 
 
 def test_detections_are_passed_on_but_not_back():
     """What A says goes by B to C, never to A again; C has A's body and calls it as A does."""
     a, b, c = (sightings(name) for name in "ABC")
-    a.see(look(0))
-    b.hear(a.compose("B", 10**5))
-    c.hear(b.compose("C", 10**5))
-    assert not b.compose("A", 10**5).looks and not c.compose("B", 10**5).looks
-    pictures = [[body.name for body in x.look(T, 3.0)] for x in (a, b, c)]
+    a.see(scan(0))
+    b.receive(a.compose("B", 10**5))
+    c.receive(b.compose("C", 10**5))
+    assert not b.compose("A", 10**5).scans and not c.compose("B", 10**5).scans
+    pictures = [[uav.name for uav in x.fuse(T, 3.0)] for x in (a, b, c)]
     assert pictures[0] == pictures[1] == pictures[2] and len(pictures[0]) == 2
     assert c.ages(T) == pytest.approx((T, T)) and a.ages(T) == ()
-    assert len(c.look(1.0, 3.0)) == 0
+    assert len(c.fuse(1.0, 3.0)) == 0
 
 
 def test_paths_over_a_transmitter_that_says_nothing_place_nobody():
     """B's paths are of A's chirps: with A's word for where it is they are bodies."""
-    silent, told = sightings("B"), sightings("B")
-    told.hear(sightings("A").compose("B", 10**5))
-    for one in (silent, told):
-        one.see(replace(look(0, "A->B"), own=Pose.at_rest((0, 20, 20), (0, -1, 0))))
-    assert len(silent.look(T, 3.0)) == 0 and len(told.look(T, 3.0)) == 2
+    silent, reported_to = sightings("B"), sightings("B")
+    reported_to.receive(sightings("A").compose("B", 10**5))
+    for one in (silent, reported_to):
+        one.see(replace(scan(0, "A->B"), own=Pose.at_rest((0, 20, 20), (0, -1, 0))))
+    assert len(silent.fuse(T, 3.0)) == 0 and len(reported_to.fuse(T, 3.0)) == 2
 
 
 def test_sightings_go_on_from_memory():
-    """Planted bugs: `told`, or who said it, left out."""
+    """Planted bugs: `reported_to`, or who said it, left out."""
     a, b = sightings("A"), sightings("B")
-    a.see(look(0))
-    b.hear(a.compose("B", 10**5))
+    a.see(scan(0))
+    b.receive(a.compose("B", 10**5))
     b.compose("C", 10**5)
     again = sightings("B")
     again.restore(unpack(*pack(b.memory())))
-    a.see(look(1))
+    a.see(scan(1))
     for one in (b, again):
-        one.hear(sightings("A").compose("B", 10**5))
+        one.receive(sightings("A").compose("B", 10**5))
     assert pack(b.memory()) == pack(again.memory())
-    assert not again.compose("C", 10**5).looks and not again.compose("A", 10**5).looks
+    assert not again.compose("C", 10**5).scans and not again.compose("A", 10**5).scans

@@ -19,7 +19,7 @@ def channels(
     level: float = 1000.0,
     noise: float = 0.0,
     leakage: float = 0.0,
-    bend: complex = 0.0,
+    curvature: complex = 0.0,
     seed: int = 4,
 ):
     """Samples (N, L_rx, L_tx) of a point echo by a board with errors, and these errors.
@@ -39,7 +39,7 @@ def channels(
     middle = np.arange(size) - (size - 1) / 2
     tau = 2 * distance / C + d[:, None] + e
     beat = np.exp(2j * np.pi * slope * tau * (middle / rate)[:, None, None])
-    echo = level * g[:, None] * h * (1 + bend * middle / (size / 2))[:, None, None] * beat
+    echo = level * g[:, None] * h * (1 + curvature * middle / (size / 2))[:, None, None] * beat
     shape = (size, num_rx, num_tx)
     white = rng.normal(size=shape) + 1j * rng.normal(size=shape)
     near = rng.normal(size=shape[1:]) + 1j * rng.normal(size=shape[1:])

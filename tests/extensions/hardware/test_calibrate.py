@@ -102,15 +102,15 @@ def test_a_board_that_is_made_up_gives_its_errors_back(board, settings):
 
 def test_the_slope_of_the_response_is_found_and_taken_out(board):
     """Planted bug: `slope += 0.5 * change`, which another start would hide."""
-    bend = -0.41 + 0.07j
-    capture, _ = board(bend=bend, noise=0.5)
+    curvature = -0.41 + 0.07j
+    capture, _ = board(curvature=curvature, noise=0.5)
     found = calibrate(capture)
-    assert found.response_slope == pytest.approx(bend, abs=5e-3)
+    assert found.response_slope == pytest.approx(curvature, abs=5e-3)
     assert found.unexplained_db > -20 > -45 > found.unexplained_response_db
     again = calibrate(apply(found, capture))
     assert again.unexplained_db == pytest.approx(found.unexplained_response_db, abs=2)
     x = (found.sweep[0].real - found.carrier_hz) / found.half_sweep_hz
-    truth = np.abs(1 + bend * x)
+    truth = np.abs(1 + curvature * x)
     assert np.abs(found.sweep[1]) == pytest.approx(truth / truth[np.abs(x).argmin()], abs=0.05)
 
 
@@ -322,7 +322,7 @@ def test_the_simulated_board_explains_the_measured(tmp_path):
     antennas = Antennas.placed(*ti_cascade())
     slope, rate, distance, size = 60e12, 8e6, 4.4, 128
     samples, _ = channels(
-        num_rx=16, num_tx=12, slope=slope, rate=rate, distance=distance, size=size, bend=-0.3
+        num_rx=16, num_tx=12, slope=slope, rate=rate, distance=distance, size=size, curvature=-0.3
     )
     target = np.array([0, distance, 0])
     middle = 77e9 + slope * (6e-6 + (size - 1) / 2 / rate)

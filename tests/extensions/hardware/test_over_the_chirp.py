@@ -63,9 +63,11 @@ def test_few_taps_read_places_nearby(most):
     for frequency in (-0.33, -0.1, 0.0, 0.21, 0.33):
         tone = np.exp(2j * np.pi * frequency * np.arange(210))
         slope = sum(a * (tone[n + t] - tone[n - t]) for t, (a, _) in enumerate(taps))
-        bend = taps[0, 1] * tone[n]
-        bend = bend + sum(b * (tone[n + t] + tone[n - t]) for t, (_, b) in enumerate(taps) if t)
+        curvature = taps[0, 1] * tone[n]
+        curvature = curvature + sum(
+            b * (tone[n + t] + tone[n - t]) for t, (_, b) in enumerate(taps) if t
+        )
         truth = np.exp(2j * np.pi * frequency * (n + shift))
-        found = tone[n] + shift * (slope + shift * bend)
+        found = tone[n] + shift * (slope + shift * curvature)
         assert np.abs(found - truth).max() < 1.05 * READ_ERROR, frequency
     assert short_read(0.4) is None

@@ -7,10 +7,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from isac_rt.extensions.city_receivers.self_calibration import FREE, Change, SelfCalibration, Sight
+from isac_rt.extensions.city_receivers.self_calibration import (
+    FREE,
+    Change,
+    KnownDirection,
+    SelfCalibration,
+)
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive.types import Look, Reception
+from isac_rt.receive.types import PathChannels, Reception
 from isac_rt.track.filter import Ambiguity, Gaussian, measure, wrapped
 from isac_rt.track.parts import Own
 from isac_rt.track.tracker import Track, Tracker, TrackSet
@@ -31,11 +36,15 @@ class LearnedHardware(SelfCalibration):
     ) -> None:
         if self._passes == 2:
             tracks = tracker.snapshot(own.pose)
-            seen = echoes(reception.looks, self.waveform, own.pose, own.mates, tracks)
+            seen = echoes(
+                reception.path_channels, self.waveform, own.pose, own.reported_poses, tracks
+            )
         elif reference is None or reference.missed:
             return
         else:
-            seen = lines_of_sight(reception.looks, own.pose, own.mates, reference.state)
+            seen = known_lines_of_sight(
+                reception.path_channels, own.pose, own.reported_poses, reference.state
+            )
         change = self.learn_all(seen, reception.neighbours if self._passes == 2 else None)
         if reference is not None:
             reference.state = seen_after(reference.state, own.pose, change, 1)
@@ -44,64 +53,70 @@ class LearnedHardware(SelfCalibration):
 
 
 def echoes(
-    looks: Sequence[Look],
+    measured_paths: Sequence[PathChannels],
     waveform: Waveform,
     own: Pose,
-    mates: Sequence[Pose],
+    reported_poses: Sequence[Pose],
     tracks: TrackSet,
-) -> list[tuple[Look, Sight]]:
+) -> list[tuple[PathChannels, KnownDirection]]:
     """Looks at an active terminal that show another terminal or a confirmed track, each once, the
     terminals first."""
-    out, left = [], list(looks)
-    for pose in mates:
-        expected, sight = _known(pose, own, 2)
+    out, left = [], list(measured_paths)
+    for pose in reported_poses:
+        expected, known_direction = _known(pose, own, 2)
         nearest = _nearest(left, expected[:2], waveform)
         if own.to_body(pose.position - own.position)[1] > 0 and nearest is not None:
-            out.append((left.pop(nearest), sight))
+            out.append((left.pop(nearest), known_direction))
     for k in np.flatnonzero(tracks.confirmed & (tracks.detection >= 0)):
         expected = np.array([tracks.range[k], tracks.velocity[k]])
         nearest = _nearest(left, expected, waveform)
         if nearest is not None and np.isfinite(tracks.direction[k]).all():
-            sight = Sight(tracks.direction[k], float(tracks.range[k]), FREE)
-            out.append((left.pop(nearest), sight))
+            known_direction = KnownDirection(tracks.direction[k], float(tracks.range[k]), FREE)
+            out.append((left.pop(nearest), known_direction))
     return out
 
 
-def lines_of_sight(
-    looks: Sequence[Look], own: Pose, mates: Sequence[Pose], reference: Gaussian
-) -> list[tuple[Look, Sight]]:
-    """The look of a passive terminal at its transmitter, which says where it is or is tracked."""
-    if mates:
-        return [(look, _known(mates[0], own, 1)[1]) for look in looks]
+def known_lines_of_sight(
+    measured_paths: Sequence[PathChannels],
+    own: Pose,
+    reported_poses: Sequence[Pose],
+    reference: Gaussian,
+) -> list[tuple[PathChannels, KnownDirection]]:
+    """The measured path of a passive terminal at its transmitter, which says where it is or is
+    tracked."""
+    if reported_poses:
+        return [(measured, _known(reported_poses[0], own, 1)[1]) for measured in measured_paths]
     z = measure(reference.mean, own)
-    return [(look, Sight(z[2:], float(z[0]), FREE)) for look in looks]
+    return [(measured, KnownDirection(z[2:], float(z[0]), FREE)) for measured in measured_paths]
 
 
-def _known(pose: Pose, own: Pose, passes: int) -> tuple[np.ndarray, Sight]:
+def _known(pose: Pose, own: Pose, passes: int) -> tuple[np.ndarray, KnownDirection]:
     """Range, its rate and direction cosines of another terminal, and the path to it and maybe
     back."""
     z = measure(np.concatenate([pose.position, pose.velocity]), own)
     of_path = np.array([z[0], z[1], POSITION_STD, VELOCITY_STD]) * passes / SPEED_OF_LIGHT
     delay, rate, delay_std, rate_std = map(float, of_path)
     path = delay, rate, delay_std, rate_std
-    return z, Sight(z[2:], float(z[0]), POSITION_STD / float(z[0]), path)
+    return z, KnownDirection(z[2:], float(z[0]), POSITION_STD / float(z[0]), path)
 
 
-def _nearest(looks: Sequence[Look], expected: np.ndarray, waveform: Waveform) -> int | None:
+def _nearest(
+    measured_paths: Sequence[PathChannels], expected: np.ndarray, waveform: Waveform
+) -> int | None:
     """The strongest echo within `NEAR_CELLS` of a range and a velocity."""
     w, best, most = waveform, None, 0.0
     cells = np.array([w.range_cell(2), w.velocity_cell(2)])
-    for i, look in enumerate(looks):
-        found = np.array([look.delay, look.delay_rate]) * SPEED_OF_LIGHT / 2
+    for i, measured in enumerate(measured_paths):
+        found = np.array([measured.delay, measured.delay_rate]) * SPEED_OF_LIGHT / 2
         apart = wrapped(found - expected, Ambiguity.of(w, 2))
-        power = float(np.sum(np.abs(look.modes[0]) ** 2))
+        power = float(np.sum(np.abs(measured.modes[0]) ** 2))
         if (np.abs(apart) < NEAR_CELLS * cells).all() and power > most:
             best, most = i, power
     return best
 
 
 def seen_after(state: Gaussian, own: Pose, change: Change, passes: int) -> Gaussian:
-    """A body as it is seen once the hardware is known better, by paths that pass the way to it so
+    """A UAV as it is seen once the hardware is known better, by paths that pass the way to it so
     often."""
     body = own.to_body(state.mean[:3] - own.position)
     distance = np.linalg.norm(body)

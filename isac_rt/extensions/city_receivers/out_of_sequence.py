@@ -48,7 +48,7 @@ class Waiting:
     path: DataPath | None = None
 
 
-class Retrospect(OtherPaths):
+class OutOfSequence(OtherPaths):
     """Frames that a passive terminal could not read, and the path over which it reads now.
 
     Parameters
@@ -86,7 +86,7 @@ class Retrospect(OtherPaths):
     ) -> tuple[Reception, bool]:
         self.late = ()
         if anchored:
-            self.look(cube, own.time)
+            self.search(cube, own.time)
             if refused:
                 self.start(delayed(reception.detections, own.clock), own.time)
         if reception.line_of_sight:
@@ -141,7 +141,7 @@ class Retrospect(OtherPaths):
             return None
         return self._over(cube, time, hints, maps=maps)
 
-    def look(self, cube: IFCube, time: float) -> None:
+    def search(self, cube: IFCube, time: float) -> None:
         """A frame without data, which tells the whole cells of those that wait."""
         if self.state.batch:
             self.state.path = self._learn(cube, time, False) or self.state.path

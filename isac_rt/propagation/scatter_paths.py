@@ -16,7 +16,7 @@ from isac_rt.world.swarm import Pose
 
 
 @dataclass(frozen=True)
-class Ways:
+class ScatterPaths:
     """K ways of waves between the ends of a link.
 
     Attributes
@@ -35,13 +35,13 @@ class Ways:
     arrival: np.ndarray
 
     @classmethod
-    def along(cls, leg: Legs) -> Ways:
+    def along(cls, leg: Legs) -> ScatterPaths:
         """From end to end in one leg."""
         ends = leg.length, leg.length, leg.departure, leg.arrival
         return cls(leg.length, leg.rate, leg.accel, *ends)
 
     @classmethod
-    def over(cls, there: Legs, back: Legs) -> Ways:
+    def over(cls, there: Legs, back: Legs) -> ScatterPaths:
         """By way of what scatters; `there` starts at the transmitter, `back` at the receiver."""
         motion = there.length + back.length, there.rate + back.rate, there.accel + back.accel
         return cls(*motion, there.length, back.length, there.departure, back.departure)
@@ -65,17 +65,17 @@ class LinkState:
     end: Pose
     target_names: tuple[str, ...] = ()
 
-    def elements(self, antennas: Antennas, ways: Ways) -> np.ndarray:
+    def elements(self, antennas: Antennas, scatter_paths: ScatterPaths) -> np.ndarray:
         """(K,) sqrt(G_tx G_rx) of the elements at both ends: the one place where antennas touch a
         gain."""
-        sent = antennas.element_gain(self.start.to_body(ways.departure))
-        if self.link.own and ways.arrival is ways.departure:
+        sent = antennas.element_gain(self.start.to_body(scatter_paths.departure))
+        if self.link.own and scatter_paths.arrival is scatter_paths.departure:
             return sent
-        return np.sqrt(sent * antennas.element_gain(self.end.to_body(ways.arrival)))
+        return np.sqrt(sent * antennas.element_gain(self.end.to_body(scatter_paths.arrival)))
 
     def paths(
         self,
-        ways: Ways,
+        scatter_paths: ScatterPaths,
         gain: np.ndarray,
         kind: np.ndarray | PathKind,
         *,
@@ -85,16 +85,16 @@ class LinkState:
         faces: np.ndarray | None = None,
     ) -> PathSet:
         """Paths along ways, with the interactions in the order in which the wave meets them; those
-        that no element sends or hears are left out."""
+        that no element sends or receives are left out."""
         columns: dict[str, Any] = dict(
             gain=gain,
-            delay=ways.length / SPEED_OF_LIGHT,
-            delay_rate=ways.rate / SPEED_OF_LIGHT,
-            delay_accel=ways.accel / SPEED_OF_LIGHT,
-            departure=ways.departure,
-            arrival=ways.arrival,
-            tx_radius=ways.tx_radius,
-            rx_radius=ways.rx_radius,
+            delay=scatter_paths.length / SPEED_OF_LIGHT,
+            delay_rate=scatter_paths.rate / SPEED_OF_LIGHT,
+            delay_accel=scatter_paths.accel / SPEED_OF_LIGHT,
+            departure=scatter_paths.departure,
+            arrival=scatter_paths.arrival,
+            tx_radius=scatter_paths.tx_radius,
+            rx_radius=scatter_paths.rx_radius,
             kind=kind,
             target=target,
             bounces=bounces,

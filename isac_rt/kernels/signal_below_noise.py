@@ -7,7 +7,7 @@ decided a few times in a frame, f for every few chirps, and amplitudes z for eve
 costs two sums of products for each receive element. With theta the turn over half a chirp from line
 to line and x the time from the middle of the chirp, what is left out of a path is f (1 - f) theta^2
 (x^2 - 1/3)/2, and the quadratic phase of motion away from the middle of the chirp: see
-`covered_error`.
+`below_noise_error`.
 
 Data delay all paths alike by D: they move the lines over the grid and turn a line of beat F by
 exp(-j 2 pi F D).
@@ -59,7 +59,7 @@ _BITS = LANES.bit_length() - 1  # n >> _BITS is n // LANES, which would mind the
 _NONE, _ONE = np.float32(0), np.float32(1)
 
 
-class Covered(NamedTuple):
+class BelowNoisePaths(NamedTuple):
     """K paths, those of one link and offset together, sixteen by sixteen: the last ones of a group
     may be repeated without amplitude.
 
@@ -67,7 +67,7 @@ class Covered(NamedTuple):
     ----------
     groups : (G, 4) link, offset, first path, and the one after its last
     phase : (L_tx, K) of each transmit element, at mid-frame and in the middle of a chirp [cycles]
-    turn, bend : (K,) by which it changes [cycles/s, cycles/s^2]
+    turn, curvature : (K,) by which it changes [cycles/s, cycles/s^2]
     amplitude : (L_tx, K) float32
     place, drift : (K,) on the grid, at mid-frame and by the second
     late : (L_tx, K) float32, by how many lines a transmit element's delay moves it
@@ -80,7 +80,7 @@ class Covered(NamedTuple):
     groups: np.ndarray
     phase: np.ndarray
     turn: np.ndarray
-    bend: np.ndarray
+    curvature: np.ndarray
     amplitude: np.ndarray
     place: np.ndarray
     drift: np.ndarray
@@ -103,7 +103,7 @@ class Batches(NamedTuple):
     parts: np.ndarray
 
 
-class Sheet(NamedTuple):
+class Buffer(NamedTuple):
     """Where lines are spread.
 
     Attributes
@@ -121,7 +121,7 @@ class Sheet(NamedTuple):
     poly: np.ndarray
 
 
-class Desk(NamedTuple):
+class Workspace(NamedTuple):
     """Memory of the sums.
 
     Attributes
@@ -156,11 +156,11 @@ def line_turn(size: int, half: float) -> float:
     return 2 * np.pi * half / (size * LINES)
 
 
-def no_paths(num_tx: int) -> Covered:
+def no_paths(num_tx: int) -> BelowNoisePaths:
     """None at all."""
     none, of_each = np.zeros(0), np.zeros((num_tx, 0))
     narrow_none = of_each.astype(np.float32)
-    return Covered(
+    return BelowNoisePaths(
         np.zeros((0, 4), np.int64),
         of_each,
         none,
@@ -175,10 +175,10 @@ def no_paths(num_tx: int) -> Covered:
     )
 
 
-def desk(paths: Covered) -> Desk:
+def make_workspace(paths: BelowNoisePaths) -> Workspace:
     """Room for the sums of these paths."""
     blocks = paths.turn.size // LANES
-    return Desk(
+    return Workspace(
         unset(blocks * _Z),
         unset(blocks * LANES * (TOGETHER // _ACROSS)),
         aligned((_BLOCK + 1) * _LINE),
@@ -232,7 +232,7 @@ def _lines(waveform: Any, size: int) -> float:
     return waveform.slope * waveform.sample_interval * size * LINES
 
 
-def covered_error(waveform: Any, tones: Any, size: int) -> np.ndarray:
+def below_noise_error(waveform: Any, tones: Any, size: int) -> np.ndarray:
     """(K,) bound of the relative RMS error over a frame of paths that noise covers, of what the
     receiver's filter would let through whole.
 
@@ -255,10 +255,10 @@ def covered_error(waveform: Any, tones: Any, size: int) -> np.ndarray:
     # parts are as long as the fastest path lets them, and cut fewer of the few when they are long
     order, parts = batches(t.antenna[0], w.num_chirps)
     stale = rate * _apart(w, order, parts) * lines * turn
-    bend = np.pi * w.slope * rate * (w.sample_interval * half) ** 2 * 2
+    curvature = np.pi * w.slope * rate * (w.sample_interval * half) ** 2 * 2
     spread = np.sqrt(1 / 5 - 1 / 9)  # of x^2
     return np.sqrt(
-        (turn**2 / 2 * between * spread) ** 2 + stale**2 / 3 + (bend * spread) ** 2 + FLOOR**2
+        (turn**2 / 2 * between * spread) ** 2 + stale**2 / 3 + (curvature * spread) ** 2 + FLOOR**2
     )
 
 
@@ -274,7 +274,7 @@ def _apart(waveform: Any, order: np.ndarray, parts: np.ndarray) -> float:
     return float(np.sqrt(np.mean((time - middle[number]) ** 2)))
 
 
-def covered_paths(
+def below_noise_paths(
     waveform: Any,
     tones: Any,
     sources: tuple[np.ndarray, np.ndarray],
@@ -282,8 +282,8 @@ def covered_paths(
     size: int,
     centre: float,
     steering: Callable[[np.ndarray, np.ndarray], np.ndarray],
-) -> Covered:
-    """The paths and offsets `sources` as arrays for `add_covered`.
+) -> BelowNoisePaths:
+    """The paths and offsets `sources` as arrays for `add_below_noise`.
 
     Parameters
     ----------
@@ -331,7 +331,7 @@ def covered_paths(
         np.argsort(below[:, first:last], axis=1, kind="stable") + first
         for first, last in groups[:, 2:]
     ]
-    return Covered(
+    return BelowNoisePaths(
         groups,
         cycles + np.angle(factor) / (2 * np.pi),
         sent * rate,
@@ -348,8 +348,8 @@ def covered_paths(
 
 @jit(fast=True, borrows=True)
 def turn_elements(steer, late, per_line):
-    """Turn the elements' phasors (of `Covered.steer`, turns over half a chirp instead of lines) by
-    what a path's delay `late`, in half chirps, does to the frequency that they see."""
+    """Turn the elements' phasors (of `BelowNoisePaths.steer`, phases over half a chirp instead of
+    lines) by what a path's delay `late`, in half chirps, does to the frequency that they see."""
     for i in range(late.shape[0]):
         at = 48 * i
         re, im, turn = load(steer, at), load(steer, at + 16), load(steer, at + 32)
@@ -360,40 +360,45 @@ def turn_elements(steer, late, per_line):
 
 
 @jit(fast=True, borrows=True)
-def _shares(desk, paths, first, last, antenna, segment):
+def _shares(workspace, paths, first, last, antenna, segment):
     """The upper lines' shares of a group's paths, in the middle of each few chirps that an antenna
     sends."""
     below, late, size = paths.below[segment], paths.late[antenna], paths.turn.shape[0]
     for half in range(TOGETHER // _ACROSS):
         middle, count = 0.0, 0
         for c in range(_ACROSS * half, _ACROSS * half + _ACROSS):
-            if desk.antenna[c] == antenna:
-                middle += desk.times[c, 0]
+            if workspace.antenna[c] == antenna:
+                middle += workspace.times[c, 0]
                 count += 1
         middle /= max(count, 1)
         for n in range(first, last, LANES):
             place = load(paths.place, n) + load(paths.drift, n) * splat(middle)
             share = narrow(place * splat(float(LINES)) - load(below, n)) + load(late, n)
-            store(desk.share, half * size + n, share)
+            store(workspace.share, half * size + n, share)
 
 
 @jit(fast=True, borrows=True)
-def _amplitudes(desk, paths, first, last, antenna):
+def _amplitudes(workspace, paths, first, last, antenna):
     """Amplitudes of a group's paths in the chirps that an antenna sends."""
     phase, amplitude = paths.phase[antenna], paths.amplitude[antenna]
     for n in range(first, last, LANES):
-        p, f, g, a = load(phase, n), load(paths.turn, n), load(paths.bend, n), load(amplitude, n)
+        p, f, g, a = (
+            load(phase, n),
+            load(paths.turn, n),
+            load(paths.curvature, n),
+            load(amplitude, n),
+        )
         for c in range(TOGETHER):
             at = n // LANES * _Z + 2 * LANES * c
-            if desk.antenna[c] != antenna:
-                store(desk.z, at, splat(np.float32(0)))
-                store(desk.z, at + LANES, splat(np.float32(0)))
+            if workspace.antenna[c] != antenna:
+                store(workspace.z, at, splat(np.float32(0)))
+                store(workspace.z, at + LANES, splat(np.float32(0)))
                 continue
-            time, data = desk.times[c, 0], desk.times[c, 1]
+            time, data = workspace.times[c, 0], workspace.times[c, 1]
             cycles = p + f * splat(time + data) + g * splat(time * time)
             re, im = cos_sin(narrow(cycles - floor(cycles + splat(0.5))))
-            store(desk.z, at, a * re)
-            store(desk.z, at + LANES, a * im)
+            store(workspace.z, at, a * re)
+            store(workspace.z, at + LANES, a * im)
 
 
 @jit(inline=True)
@@ -404,54 +409,54 @@ def _one(z, j, sr, si, ar, ai):
 
 
 @jit(fast=True, borrows=True)
-def _weigh(desk, antenna, w, sheet):
+def _weigh(workspace, antenna, w, buffer):
     """Where the data of the chirps that an antenna sends move all lines: by whole lines, and the
     weights of the `LINES` places within a grid step that are left."""
     for c in range(TOGETHER):
-        if desk.antenna[c] != antenna:
+        if workspace.antenna[c] != antenna:
             continue
-        moved = w.slope * w.step * sheet.size * LINES * desk.times[c, 1]
-        desk.shift[c] = int(np.floor(moved))
-        r = narrow(load(desk.place, 0) + splat((moved - np.floor(moved)) / LINES))
+        moved = w.slope * w.step * buffer.size * LINES * workspace.times[c, 1]
+        workspace.shift[c] = int(np.floor(moved))
+        r = narrow(load(workspace.place, 0) + splat((moved - np.floor(moved)) / LINES))
         for j in range(TAPS):
-            v = splat(sheet.poly[j])
+            v = splat(buffer.poly[j])
             for d in range(1, TAPS + EXTRA + 1):
-                v = v * r + splat(sheet.poly[d * TAPS + j])
-            store(desk.weights, (c * TAPS + j) * LANES, v)
+                v = v * r + splat(buffer.poly[d * TAPS + j])
+            store(workspace.weights, (c * TAPS + j) * LANES, v)
 
 
 @jit(fast=True, borrows=True)
-def _factors(desk, count, antenna, w, sheet):
+def _factors(workspace, count, antenna, w, buffer):
     """Factors of `count` lines in the chirps that an antenna sends."""
-    to_beat = 1 / (LINES * w.step * sheet.size)
-    low, high = desk.lines[0] * to_beat, desk.lines[count - 1] * to_beat
+    to_beat = 1 / (LINES * w.step * buffer.size)
+    low, high = workspace.lines[0] * to_beat, workspace.lines[count - 1] * to_beat
     for c in range(TOGETHER):
-        if desk.antenna[c] != antenna:
+        if workspace.antenna[c] != antenna:
             continue
-        data, sent = desk.times[c, 1], desk.sent[c]
+        data, sent = workspace.times[c, 1], workspace.sent[c]
         re, im = splat(np.float32(sent.real)), splat(np.float32(sent.imag))
         own = c * 2 * _BLOCK
         for b in range(0, count, LANES):
-            turned = load(desk.lines, b) * splat(-to_beat * data)
+            turned = load(workspace.lines, b) * splat(-to_beat * data)
             x, y = cos_sin(narrow(turned - floor(turned + splat(0.5))))
-            store(desk.factor, own + b, x * re - y * im)
-            store(desk.factor, own + _BLOCK + b, x * im + y * re)
+            store(workspace.factor, own + b, x * re - y * im)
+            store(workspace.factor, own + _BLOCK + b, x * im + y * re)
         if low + w.slope * data < 0 or high + w.slope * data > w.rate:
             for b in range(count):
-                gain = np.float32(passed(w, desk.lines[b] * to_beat / w.slope + data))
-                desk.factor[own + b] *= gain
-                desk.factor[own + _BLOCK + b] *= gain
+                gain = np.float32(passed(w, workspace.lines[b] * to_beat / w.slope + data))
+                workspace.factor[own + b] *= gain
+                workspace.factor[own + _BLOCK + b] *= gain
 
 
 @jit(fast=True, borrows=True)
-def _sum(desk, count, sheet, paths, order, chirps):
+def _sum(workspace, count, buffer, paths, order, chirps):
     """Sum the paths beside each of `count` lines in the `chirps` of a batch. What paths leave to
     the line after theirs is there when its turn comes. Unsigned indices are not checked for their
     sign."""
-    steer, z, sums, shares = paths.steer, desk.z, desk.sums, desk.share
+    steer, z, sums, shares = paths.steer, workspace.z, workspace.sums, workspace.share
     size = paths.turn.shape[0]
     for b in range(count):
-        begin, end, line = desk.begin[b], desk.end[b], _LINE * b
+        begin, end, line = workspace.begin[b], workspace.end[b], _LINE * b
         for first in range(0, chirps, _ACROSS):  # as often as before, which processors foresee
             own, to_z = first // _ACROSS * size, 2 * LANES * first
             for lane in range(0, LANES, PART):
@@ -466,7 +471,7 @@ def _sum(desk, count, sheet, paths, order, chirps):
                     k, j = 48 * n + lane, (n >> _BITS) * _Z + (n & LANES - 1) + to_z
                     share = load_part(steer, k + 32) + shares[np.uint64(own + n)]
                     under = _ONE - share
-                    more = _ONE + share * under * np.float32(sheet.more)
+                    more = _ONE + share * under * np.float32(buffer.more)
                     share, under = share * more, under * more
                     sr, si = load_part(steer, k), load_part(steer, k + 16)
                     tr, ti = sr * share, si * share
@@ -509,17 +514,17 @@ def _add_four(grids, to, ar, ai, br, bi, cr, ci, dr, di):
 
 
 @jit(fast=True, borrows=True)
-def _spread(grids, desk, count, c, sheet, lane):
+def _spread(grids, workspace, count, c, buffer, lane):
     """Spread the sums of `count` lines in chirp c at the elements from `lane` on. Lines of one grid
     step are added together in registers before the grid is written."""
-    shift, size, weights = desk.shift[c], sheet.size, desk.weights
-    base, at, k = c * sheet.stride + sheet.inner + lane, c * _SUM + lane, c * 2 * _BLOCK
-    last = (int(desk.lines[0]) + shift) // LINES
+    shift, size, weights = workspace.shift[c], buffer.size, workspace.weights
+    base, at, k = c * buffer.stride + buffer.inner + lane, c * _SUM + lane, c * 2 * _BLOCK
+    last = (int(workspace.lines[0]) + shift) // LINES
     row = last % size
-    zero = _NONE * load_part(desk.sums, at)
+    zero = _NONE * load_part(workspace.sums, at)
     ar, ai, br, bi, cr, ci, dr, di = zero, zero, zero, zero, zero, zero, zero, zero
     for b in range(count):
-        place = int(desk.lines[b]) + shift
+        place = int(workspace.lines[b]) + shift
         steps = place // LINES - last
         if steps > 0:
             to = base + row * ROW
@@ -531,8 +536,8 @@ def _spread(grids, desk, count, c, sheet, lane):
                 ar, ai, br, bi, cr, ci, dr, di = zero, zero, zero, zero, zero, zero, zero, zero
             last += steps
             row = last % size
-        x, y = desk.factor[k + b], desk.factor[k + _BLOCK + b]
-        sr, si = load_part(desk.sums, at), load_part(desk.sums, at + 16)
+        x, y = workspace.factor[k + b], workspace.factor[k + _BLOCK + b]
+        sr, si = load_part(workspace.sums, at), load_part(workspace.sums, at + 16)
         sr, si = x * sr - y * si, x * si + y * sr
         j = c * TAPS * LANES + place % LINES
         u, v = weights[j], weights[j + LANES]
@@ -544,10 +549,10 @@ def _spread(grids, desk, count, c, sheet, lane):
 
 
 @jit(fast=True, borrows=True)
-def _send(desk, chirps, link, offset, t, w):
+def _send(workspace, chirps, link, offset, t, w):
     """Compute the signals that reach the chirps of a batch from a link's transmitter, per group."""
     groups, num_chirps = t.send.shape[1:]
-    desk.antenna[:] = -1
+    workspace.antenna[:] = -1
     for c in range(chirps.shape[0]):
         m, p = chirps[c] // num_chirps, chirps[c] % num_chirps
         source = m - offset
@@ -556,14 +561,14 @@ def _send(desk, chirps, link, offset, t, w):
         data = t.symbol_delay[link, source, p]
         cycles = data * (w.carrier + w.slope * w.middle - w.slope / 2 * data)
         turned = 2 * np.pi * (cycles - np.floor(cycles))
-        desk.sent[c] = t.send[link, source, p] * complex(np.cos(turned), np.sin(turned))
-        desk.times[c, 0] = w.first + p * w.slot + m * w.spacing
-        desk.times[c, 1] = data
-        desk.antenna[c] = t.antenna[link, source, p]
+        workspace.sent[c] = t.send[link, source, p] * complex(np.cos(turned), np.sin(turned))
+        workspace.times[c, 0] = w.first + p * w.slot + m * w.spacing
+        workspace.times[c, 1] = data
+        workspace.antenna[c] = t.antenna[link, source, p]
 
 
 @jit(fast=True, borrows=True)
-def _gather(desk, order, below, i, stop, line, pending):
+def _gather(workspace, order, below, i, stop, line, pending):
     """The next lines, a block at most, and which paths lie above each, from place i of `order` on;
     `pending` : whether paths above `line` have a share in the next.
 
@@ -574,43 +579,43 @@ def _gather(desk, order, below, i, stop, line, pending):
     count = 0
     while count < _BLOCK and (pending or i < stop):
         line = line + 1.0 if pending else below[order[i]]
-        desk.lines[count], desk.begin[count] = line, i
+        workspace.lines[count], workspace.begin[count] = line, i
         while i < stop and below[order[i]] == line:
             i += 1
-        desk.end[count] = i
-        pending = i > desk.begin[count]
+        workspace.end[count] = i
+        pending = i > workspace.begin[count]
         count += 1
     return count, i, line, pending
 
 
 @jit(fast=True, borrows=True)
-def add_covered(grids, paths, segment, chirps, t, w, sheet, desk):
+def add_below_noise(grids, paths, segment, chirps, t, w, buffer, workspace):
     """Add all paths to the grids of a batch of chirps."""
     order, below = paths.order[segment], paths.below[segment]
     begin = 0
     for g in range(paths.groups.shape[0]):
         link, offset, first, end = paths.groups[g]
-        _send(desk, chirps, link, offset, t, w)
+        _send(workspace, chirps, link, offset, t, w)
         stop = begin + end - first
         for antenna in range(paths.phase.shape[0]):
             sends = False
             for c in range(TOGETHER):
-                sends |= desk.antenna[c] == antenna
+                sends |= workspace.antenna[c] == antenna
             if not sends:
                 continue
             last = first + (end - first + LANES - 1) // LANES * LANES
-            _shares(desk, paths, first, last, antenna, segment)
-            _amplitudes(desk, paths, first, last, antenna)
-            _weigh(desk, antenna, w, sheet)
-            desk.sums[:_LINE] = np.float32(0)
+            _shares(workspace, paths, first, last, antenna, segment)
+            _amplitudes(workspace, paths, first, last, antenna)
+            _weigh(workspace, antenna, w, buffer)
+            workspace.sums[:_LINE] = np.float32(0)
             i, line, pending = begin, 0.0, False
             while pending or i < stop:
-                count, i, line, pending = _gather(desk, order, below, i, stop, line, pending)
-                _factors(desk, count, antenna, w, sheet)
-                _sum(desk, count, sheet, paths, order, chirps.shape[0])
+                count, i, line, pending = _gather(workspace, order, below, i, stop, line, pending)
+                _factors(workspace, count, antenna, w, buffer)
+                _sum(workspace, count, buffer, paths, order, chirps.shape[0])
                 for c in range(TOGETHER):
-                    for lane in range(0, LANES if desk.antenna[c] == antenna else 0, PART):
-                        _spread(grids, desk, count, c, sheet, lane)
+                    for lane in range(0, LANES if workspace.antenna[c] == antenna else 0, PART):
+                        _spread(grids, workspace, count, c, buffer, lane)
                 for at in range(0, _LINE, LANES):
-                    store(desk.sums, at, load(desk.sums, count * _LINE + at))
+                    store(workspace.sums, at, load(workspace.sums, count * _LINE + at))
         begin = stop

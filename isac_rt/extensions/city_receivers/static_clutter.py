@@ -5,7 +5,7 @@ the wall, whose brightest spots pass the threshold that its mean return sets. It
 and in one place. What stands still in the world at several places near each other, and is explained
 by nothing that the terminal knows, is a surface. The terminal remembers such echoes for a while,
 because each frame shows other parts of it. Echoes of one surface are about as strong as each other:
-what stands far out of its neighbours is a body, and no neighbour of what is far weaker.
+what stands far out of its neighbours is a UAV, and no neighbour of what is far weaker.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Seen:
     echoes: np.ndarray = field(default_factory=lambda: np.zeros((0, 5)))
 
 
-class Standing(TrackRule):
+class StaticClutter(TrackRule):
     """Where echoes stood still that nothing explains.
 
     Parameters
@@ -73,7 +73,7 @@ class Standing(TrackRule):
     @classmethod
     def of(
         cls, antennas: Antennas, waveform: Waveform, passes: int, walls: Walls | None
-    ) -> Standing:
+    ) -> StaticClutter:
         """For the array of an active terminal (passes = 2) or a passive one."""
         period = Ambiguity.of(waveform, passes).period
         return cls(antennas.turn(waveform.wavelength, passes), walls, period)
@@ -82,7 +82,7 @@ class Standing(TrackRule):
         self._crowd = np.zeros(len(detections), bool)
         if own.clutter_known:  # else the city's own echoes are among them
             sender = None if own.transmitter is None else own.transmitter.mean[:6]
-            self._crowd = self.look(detections, own.pose, own.time, sender)
+            self._crowd = self.update(detections, own.pose, own.time, sender)
         return replace(detections, starts=detections.starts & ~self._crowd)
 
     def prune(self, tracker: Tracker, own: Own) -> None:
@@ -93,7 +93,7 @@ class Standing(TrackRule):
         still = {t.id for t in tracker.tracks if self.holds(t)}
         tracker.drop(still | (fed & own.tentative))
 
-    def look(
+    def update(
         self,
         d: Detections,
         own: Pose,

@@ -1,11 +1,10 @@
 """Visibility: shadow rays, and the visibility of a scatterer along a flight.
 
-Rays are tested from knots, places every half metre along a flight as it is planned. Where a
-scatterer is seen from one knot and not from the next, `penumbra` finds the shadow edge in between,
-and about it sight is the modulus of the knife edge's factor; several crossings add up as the
-apertures do that they bound. Sight is a function of the time alone: a frame is the same whether the
-frames before it were computed or not. Import only after `isac_rt.runtime.activate()`.
-"""
+Rays are tested from time samples, places every half metre along a flight as it is planned. Where a
+scatterer is seen from one time sample and not from the next, `penumbra` finds the shadow edge in
+between, and about it sight is the modulus of the knife edge's factor; several crossings add up as
+the apertures do that they bound. Sight is a function of the time alone: a frame is the same whether
+the frames before it were computed or not. Import only after `isac_rt.runtime.activate()`."""
 
 from __future__ import annotations
 
@@ -24,34 +23,34 @@ from isac_rt.storage import checksum, kept, pack
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Trajectory
 
-KNOT_SPACING = 0.5
+SAMPLE_SPACING = 0.5
 """Flight from one test of the rays to the next [m]."""
 OFF_FLIGHT = 1e-3
 """A pose farther than this from the planned flight [m] has its rays tested by itself."""
 REACH = 3
-"""Knots on each side that matter to a blend, which is how sight by way of mirrors comes and
+"""Time samples on each side that matter to a blend, which is how sight by way of mirrors comes and
 goes."""
 AROUND = 8
-"""Knots on each side whose crossings are known."""
+"""Time samples on each side whose crossings are known."""
 TOGETHER = 4
-"""Knots that are tested, and kept for later runs, at once."""
-LOOKS = 81
+"""Time samples that are tested, and kept for later runs, at once."""
+BORESIGHT_SAMPLES = 81
 """Instants of a run at which it is asked what lies before a terminal."""
 WIDEST = (AROUND - 1) / PENUMBRA
-"""Widest penumbra, in knots per Fresnel unit: it must have passed when its crossing is
+"""Widest penumbra, in time samples per Fresnel unit: it must have passed when its crossing is
 forgotten."""
 BLEND = BSpline.basis_element(np.arange(-REACH, REACH + 1))
 
 
 class Flight:
-    """One terminal's way through a run, with its knots.
+    """One terminal's way through a run, with its time samples.
 
     Parameters
     ----------
     trajectory : of the terminal
     duration : of the run [s]
     origin : (3,) of the local coordinates [m]
-    spacing : most flight from knot to knot [m]
+    spacing : most flight from time sample to time sample [m]
     """
 
     def __init__(
@@ -59,26 +58,30 @@ class Flight:
         trajectory: Trajectory,
         duration: float,
         origin: np.ndarray,
-        spacing: float = KNOT_SPACING,
+        spacing: float = SAMPLE_SPACING,
     ) -> None:
         self._trajectory, self._origin = trajectory, origin
         self._times = np.linspace(0.0, duration, 2001)
         track = trajectory.positions(self._times)
-        self._way = np.concatenate(
+        self._distance = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(track, axis=0), axis=1))]
         )
-        self.spacing = max(self._way[-1] / max(np.ceil(self._way[-1] / spacing), 1.0), 1e-9)
-        count = round(self._way[-1] / self.spacing) + 1
-        times = np.interp(self.spacing * np.arange(count), self._way, self._times)
-        self.knots = trajectory.positions(times) - origin
+        self.spacing = max(
+            self._distance[-1] / max(np.ceil(self._distance[-1] / spacing), 1.0), 1e-9
+        )
+        count = round(self._distance[-1] / self.spacing) + 1
+        times = np.interp(self.spacing * np.arange(count), self._distance, self._times)
+        self.time_samples = trajectory.positions(times) - origin
         """(K, 3) local [m]"""
 
     @cached_property
     def fronts(self) -> np.ndarray:
         """(S, 5) planes across the boresights that the terminal has in the run: a unit vector, how
         far along it begins what lies before such a plane [m], and how far a boresight turns from
-        one of the `LOOKS` to the next [rad]."""
-        poses = [self._trajectory.pose(time) for time in self._times[:: 2000 // (LOOKS - 1)]]
+        one of the `BORESIGHT_SAMPLES` to the next [rad]."""
+        poses = [
+            self._trajectory.pose(time) for time in self._times[:: 2000 // (BORESIGHT_SAMPLES - 1)]
+        ]
         places = np.array([pose.position for pose in poses]) - self._origin
         boresights = np.array([pose.rotation[:, 1] for pose in poses])
         step, turn = (
@@ -97,27 +100,27 @@ class Flight:
         )
 
     def number(self, time: float) -> float:
-        """Knots passed at a time, a fraction of the way to the next included."""
-        return float(np.interp(time, self._times, self._way) / self.spacing)
+        """Time samples passed at a time, a fraction of the way to the next included."""
+        return float(np.interp(time, self._times, self._distance) / self.spacing)
 
     def blend(self, time: float) -> dict[int, float]:
-        """Knots that matter at a time, with their weights, which sum to one: a quintic B-spline
-        over the way flown."""
+        """Time samples that matter at a time, with their weights, which sum to one: a quintic
+        B-spline over the way flown."""
         q = self.number(time)
         nearby = np.arange(np.ceil(q - REACH), q + REACH)
         out: dict[int, float] = {}
-        for knot, weight in zip(
-            np.clip(nearby, 0, len(self.knots) - 1).astype(int).tolist(),
+        for time_sample, weight in zip(
+            np.clip(nearby, 0, len(self.time_samples) - 1).astype(int).tolist(),
             BLEND(nearby - q).tolist(),
             strict=True,
         ):
-            out[knot] = out.get(knot, 0.0) + weight
+            out[time_sample] = out.get(time_sample, 0.0) + weight
         return out
 
 
 def ever_ahead(fronts: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(N,) whether points (N, 3), local, lie before any of some `Flight.fronts` (S, 5), or so near
-    to one that they might between two `LOOKS`."""
+    to one that they might between two `BORESIGHT_SAMPLES`."""
     normals, begins, turn = np.split(fronts, [3, 4], axis=1)
     farthest = np.linalg.norm(points, axis=1).max(initial=0.0)
     out = np.zeros(len(points), bool)
@@ -127,14 +130,14 @@ def ever_ahead(fronts: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 class _Stretch(NamedTuple):
-    """`TOGETHER` knots of a flight and the next: bits (TOGETHER + 1, N / 8) of what each sees, and
-    what crosses an edge between two of them."""
+    """`TOGETHER` time samples of a flight and the next: bits (TOGETHER + 1, N / 8) of what each
+    sees, and what crosses an edge between two of them."""
 
     seen: np.ndarray
     crossed: list[Crossings]
 
 
-class Sight:
+class Visibility:
     """Visibility of N points from each terminal at any time of a run: 0, 1, and the modulus of the
     knife edge's factor in between.
 
@@ -178,15 +181,15 @@ class Sight:
         if not flight.holds(pose, time):
             return self.from_places(pose.position[None])[0].astype(np.float32)
         q = flight.number(time)
-        knot = int(np.clip(np.rint(q), 0, len(flight.knots) - 1))
-        if name not in self._nearby or self._nearby[name].knot != knot:
-            self._nearby[name] = self._near(name, knot)
+        time_sample = int(np.clip(np.rint(q), 0, len(flight.time_samples) - 1))
+        if name not in self._nearby or self._nearby[name].time_sample != time_sample:
+            self._nearby[name] = self._near(name, time_sample)
         near = self._nearby[name]
-        bits = self._stretch(name, knot // TOGETHER).seen[knot % TOGETHER]
+        bits = self._stretch(name, time_sample // TOGETHER).seen[time_sample % TOGETHER]
         out = np.unpackbits(bits, count=len(self._facets.points)).astype(np.float32)
         if near.row.size:
             step = np.where(near.gained, 1, -1) * (
-                penumbra((q - near.where) / near.width) - (near.where < knot)
+                penumbra((q - near.where) / near.width) - (near.where < time_sample)
             )
             some = (
                 out[near.index]
@@ -207,17 +210,19 @@ class Sight:
         out[left] = self.shadows.ever_sees(places, points, normals)
         return out
 
-    def _near(self, name: str, knot: int) -> _Nearby:
-        """The crossings that matter about a knot, as one list."""
+    def _near(self, name: str, time_sample: int) -> _Nearby:
+        """The crossings that matter about a time sample, as one list."""
         flight = self.flights[name]
-        spans = range(max(knot - AROUND, 0), min(knot + AROUND, len(flight.knots) - 1))
+        spans = range(
+            max(time_sample - AROUND, 0), min(time_sample + AROUND, len(flight.time_samples) - 1)
+        )
         parts = [self._stretch(name, n // TOGETHER).crossed[n % TOGETHER] for n in spans]
-        reach = range((knot - AROUND) // TOGETHER, (knot + AROUND) // TOGETHER + 1)
+        reach = range((time_sample - AROUND) // TOGETHER, (time_sample + AROUND) // TOGETHER + 1)
         for key in [k for k in self._stretches if k[0] == name and k[1] not in reach]:
             del self._stretches[key]
         if not parts:
             types = np.int32, np.int32, float, float, bool
-            return _Nearby(knot, *(np.zeros(0, dtype) for dtype in types))
+            return _Nearby(time_sample, *(np.zeros(0, dtype) for dtype in types))
         index, row = np.unique(np.concatenate([c.index for c in parts]), return_inverse=True)
         where = np.concatenate(
             [number + c.where.astype(float) for number, c in zip(spans, parts, strict=True)]
@@ -225,37 +230,44 @@ class Sight:
         width = np.concatenate([c.width for c in parts]) / flight.spacing
         gained = np.concatenate([c.gained for c in parts])
         return _Nearby(
-            knot, index, row.ravel().astype(np.int32), where, np.minimum(width, WIDEST), gained
+            time_sample,
+            index,
+            row.ravel().astype(np.int32),
+            where,
+            np.minimum(width, WIDEST),
+            gained,
         )
 
     def _stretch(self, name: str, number: int) -> _Stretch:
         """Return what is visible, and what crosses edges, along a stretch of a flight."""
         if (name, number) not in self._stretches:
-            knots = self.flights[name].knots[TOGETHER * number : TOGETHER * (number + 1) + 1]
+            time_samples = self.flights[name].time_samples[
+                TOGETHER * number : TOGETHER * (number + 1) + 1
+            ]
 
             def found() -> dict[str, Any]:
-                seen = self.from_places(knots)
-                pairs = [slice(k, k + 2) for k in range(len(knots) - 1)]
-                crossed = [self._crossings(knots[pair], seen[pair]) for pair in pairs]
+                seen = self.from_places(time_samples)
+                pairs = [slice(k, k + 2) for k in range(len(time_samples) - 1)]
+                crossed = [self._crossings(time_samples[pair], seen[pair]) for pair in pairs]
                 return {"seen": np.packbits(seen, axis=1), "crossed": [vars(c) for c in crossed]}
 
             self._content = self._content or checksum(*pack(self._depends_on))
-            of = kept("sight", [self._content, knots], found)
+            of = kept("sight", [self._content, time_samples], found)
             crossed = [Crossings(**c) for c in of["crossed"]]
             self._stretches[name, number] = _Stretch(of["seen"], crossed)
         return self._stretches[name, number]
 
-    def _crossings(self, knots: np.ndarray, seen: np.ndarray) -> Crossings:
+    def _crossings(self, time_samples: np.ndarray, seen: np.ndarray) -> Crossings:
         """Return what crosses an edge between two time samples (2, 3), seen (2, N) from either."""
-        return crossings(self.shadows.triangles, knots, seen, self._facets, self._wavelength)
+        return crossings(self.shadows.triangles, time_samples, seen, self._facets, self._wavelength)
 
 
 @dataclass(frozen=True)
 class _Nearby:
-    """Crossings about one knot; `index` (R,) are the scatterers, `row` (K,) says which of them each
-    crossing is of; `where` and `width` (K,) are counted in knots."""
+    """Crossings about one time sample; `index` (R,) are the scatterers, `row` (K,) says which of
+    them each crossing is of; `where` and `width` (K,) are counted in time samples."""
 
-    knot: int
+    time_sample: int
     index: np.ndarray
     row: np.ndarray
     where: np.ndarray

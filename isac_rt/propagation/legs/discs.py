@@ -1,4 +1,4 @@
-"""The swarm's own bodies in the way of waves: each an opaque disc across the path, with its Fresnel
+"""The swarm's own UAVs in the way of waves: each an opaque disc across the path, with its Fresnel
 shadow."""
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isac_rt.kernels import propagation_bodies
+from isac_rt.kernels import propagation_discs
 from isac_rt.kernels.jit import twin_of
 from isac_rt.propagation.legs.diffraction import LIT_REACH, disc, fresnel_unit, tapered
 from isac_rt.world.settings import Uav
@@ -16,12 +16,12 @@ from isac_rt.world.swarm import Pose
 
 
 @dataclass(frozen=True)
-class Bodies:
-    """All bodies at one instant, local coordinates.
+class UavDiscs:
+    """All UAVs at one instant, local coordinates.
 
     Attributes
     ----------
-    names : of the N bodies that have a size
+    names : of the N UAVs that have a size
     places : (N, 3) [m]
     radii : (N,) [m]
     """
@@ -31,20 +31,20 @@ class Bodies:
     radii: np.ndarray
 
     @classmethod
-    def of(cls, uavs: Mapping[str, Uav], poses: dict[str, Pose]) -> Bodies:
-        """Bodies of a scenario's UAVs where they are."""
+    def of(cls, uavs: Mapping[str, Uav], poses: dict[str, Pose]) -> UavDiscs:
+        """UAVs of a scenario's UAVs where they are."""
         names = tuple(name for name, uav in uavs.items() if uav.body_radius_m > 0 and name in poses)
         places = np.array([poses[name].position for name in names]).reshape(-1, 3)
         return cls(names, places, np.array([uavs[name].body_radius_m for name in names]))
 
     def spared(self, names: Sequence[Collection[str]]) -> np.ndarray:
-        """(R, N) which bodies are at the ends of each of R legs, or echo: a body does not shadow
+        """(R, N) which UAVs are at the ends of each of R legs, or echo: a body does not shadow
         itself."""
         rows = [[body in of_leg for body in self.names] for of_leg in names]
         return np.array(rows, bool).reshape(len(rows), len(self.names))
 
     def factor(self, chain: np.ndarray, wavelength: float, spared: np.ndarray) -> np.ndarray:
-        """Amplitude factor of paths past the bodies: the product of `disc` over the bodies and the
+        """Amplitude factor of paths past the UAVs: the product of `disc` over the UAVs and the
         straight parts.
 
         Parameters
@@ -52,7 +52,7 @@ class Bodies:
         chain : (K, B + 2, 3) both ends and the B points between them at which each path is mirrored
             or bent
         wavelength : [m]
-        spared : (K, N), or (1, N) for all, which bodies leave a path alone
+        spared : (K, N), or (1, N) for all, which UAVs leave a path alone
 
         Returns
         -------
@@ -97,7 +97,7 @@ class Bodies:
         return path
 
 
-@twin_of(propagation_bodies.near)
+@twin_of(propagation_discs.near)
 def near(starts, ends, before, total, places, radii, spared, wavelength, reach):
     """Find the straight segments (K,) that pass a disc (N,) within `reach` Fresnel units of its
     edge, unless `spared` (K or 1, N).

@@ -1,4 +1,4 @@
-"""Kernel of `isac_rt.propagation.legs.bodies`."""
+"""Kernel of `isac_rt.propagation.legs.discs`."""
 
 from __future__ import annotations
 
