@@ -61,7 +61,7 @@ def test_detections_are_heard_as_the_links_carry_them(pooled):
     tracks 16 and 165; the newest frame's fit and no other's. The feedback has 1000. Planted
     bugs: what a pilot carries; bits of lost messages left out."""
     d, p = pooled.dataset, pooled.summary["swarm"]["terminals"]
-    k = list(d.fused_tracks.values).index("PT")
+    k = list(d.picture.values).index("PT")
     assert d.picture_room.values[:, k].tolist() == [0, 0] + [886] * 7
     assert d.picture_reports.values[:3, k].tolist()[:2] == [0, 0]
     assert (d.picture_reports.values[3:, k] > 0).all()
@@ -109,7 +109,7 @@ def test_who_hears_what_and_when(talked):
     d = talked.dataset
     received = {"AT": ([1] * 6, [0.02] * 6), "PT": ([1, 2, 2, 2, 2, 2], [0.02] + [0.03] * 5)}
     for name, (count, age) in received.items():
-        p = list(d.fused_tracks.values).index(name)
+        p = list(d.picture.values).index(name)
         assert d.picture_reports.values[:, p].tolist() == [0] * 3 + count
         assert np.allclose(d.picture_age.values[3:, p], age)
 

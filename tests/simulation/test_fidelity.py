@@ -349,6 +349,6 @@ def test_knots_lie_as_far_apart_as_the_plan_says():
     assert plan.max_untraced == 1.7
     for name in plan.swarm.terminals:
         flight = Flight(plan.swarm.trajectories[name], plan.swarm.duration, np.zeros(3), 1.7)
-        apart = np.linalg.norm(np.diff(flight.knots, axis=0), axis=1)
+        apart = np.linalg.norm(np.diff(flight.time_samples, axis=0), axis=1)
         assert 1.5 < apart.min() and apart.max() <= 1.7
     assert plan_of("munich_swarm.yaml", "accuracy.preset=everything").max_untraced == 0.0

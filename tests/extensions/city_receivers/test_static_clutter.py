@@ -52,7 +52,7 @@ def test_a_wall_is_a_crowd_and_who_flies_before_it_is_not():
         0.0, [*WALL, (0.0, 28.0, 6.0), (10.0, 90.0, 5.0)], [(0, 0, 0)] * 5 + [(0, -2, 0), (0, 0, 0)]
     )
     assert (
-        StaticClutter(1.71, None, PERIOD).look(d, own(0.0), 0.0).tolist()
+        StaticClutter(1.71, None, PERIOD).update(d, own(0.0), 0.0).tolist()
         == [True] * 5 + [False] * 2
     )
 
@@ -65,8 +65,8 @@ def test_a_wall_beyond_the_view_is_seen_elsewhere_and_still_stands():
     d = seen(0.0, places)
     seen_at = Detections(**{**vars(d), "direction": d.direction - [1.71, 0.0]})
     assert (d.direction[:, 0] > 0.9).all()
-    assert StaticClutter(1.71, None, PERIOD).look(seen_at, own(0.0), 0.0).all()
-    assert not StaticClutter(np.inf, None, PERIOD).look(seen_at, own(0.0), 0.0).any()
+    assert StaticClutter(1.71, None, PERIOD).update(seen_at, own(0.0), 0.0).all()
+    assert not StaticClutter(np.inf, None, PERIOD).update(seen_at, own(0.0), 0.0).any()
 
 
 def test_a_wall_along_the_wings_is_one_whatever_the_error():
@@ -79,13 +79,13 @@ def test_a_wall_along_the_wings_is_one_whatever_the_error():
     assert (np.linalg.norm(out + np.array([1.71, 0.0]), axis=1) > 1.007).all()
     for std, stands in ((0.01, True), (0.002, False)):
         seen_at = Detections(**{**vars(d), "direction": out, "std": np.full((5, 4), std)})
-        assert (StaticClutter(1.71, None, PERIOD).look(seen_at, own(0.0), 0.0) == stands).all()
+        assert (StaticClutter(1.71, None, PERIOD).update(seen_at, own(0.0), 0.0) == stands).all()
 
 
 def test_velocities_are_folded():
     d = seen(0.0, WALL)
     folded = Detections(**{**vars(d), "velocity": d.velocity + PERIOD})
-    assert StaticClutter(1.71, None, PERIOD).look(folded, own(0.0), 0.0).all()
+    assert StaticClutter(1.71, None, PERIOD).update(folded, own(0.0), 0.0).all()
 
 
 def test_a_uav_that_hovers_alone_is_no_crowd():
@@ -94,7 +94,7 @@ def test_a_uav_that_hovers_alone_is_no_crowd():
     for frame in range(30):
         place = np.array([2.0, 25.0, 6.0]) + rng.normal(0, 0.3, 3)
         time = 0.05 * frame
-        assert not static_clutter.look(seen(time, [place]), own(time), time).any()
+        assert not static_clutter.update(seen(time, [place]), own(time), time).any()
 
 
 def test_a_wall_that_shows_itself_piece_by_piece():
@@ -102,20 +102,20 @@ def test_a_wall_that_shows_itself_piece_by_piece():
     memory it is not. Planted bugs: no memory; no end of it."""
     static_clutter = StaticClutter(1.71, None, PERIOD)
     found = [
-        bool(static_clutter.look(seen(t := 0.1 * k, [WALL[k]]), own(t), t)[0]) for k in range(4)
+        bool(static_clutter.update(seen(t := 0.1 * k, [WALL[k]]), own(t), t)[0]) for k in range(4)
     ]
     assert found == [False, False, False, True]
     again = StaticClutter(1.71, None, PERIOD)
     again.restore(static_clutter.memory())
-    assert again.look(seen(0.4, [WALL[4]]), own(0.4), 0.4).all()
+    assert again.update(seen(0.4, [WALL[4]]), own(0.4), 0.4).all()
     late = 0.4 + MEMORY_S + 0.01
-    assert not again.look(seen(late, [WALL[0]]), own(late), late).any()
+    assert not again.update(seen(late, [WALL[0]]), own(late), late).any()
 
 
 def test_only_what_could_start_a_track_makes_a_crowd():
     """What the city explains is no surface that it lacks."""
     d = seen(0.0, WALL, starts=[False] * 5)
-    assert not StaticClutter(1.71, None, PERIOD).look(d, own(0.0), 0.0).any()
+    assert not StaticClutter(1.71, None, PERIOD).update(d, own(0.0), 0.0).any()
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_only_what_could_start_a_track_makes_a_crowd():
 def test_a_track_that_stands_still_within_a_crowd(place, velocity, std, expected):
     """Planted bugs: the speed alone; the place alone."""
     static_clutter = StaticClutter(1.71, None, PERIOD)
-    static_clutter.look(seen(0.0, WALL), own(0.0), 0.0)
+    static_clutter.update(seen(0.0, WALL), own(0.0), 0.0)
     P = np.diag([0.01] * 3 + [std**2] * 3 + [9.0] * 3)
     track = Track(1, Gaussian(np.array([*place, *velocity, 0, 0, 0]), P), 10.0)
     assert static_clutter.holds(track) is expected
@@ -151,7 +151,7 @@ def test_a_wall_stands_still_for_a_passive_terminal():
     d = seen(0.0, places)
     d = Detections(**{**vars(d), "range": far[0] + far[1], "velocity": rate})
     static_clutter = StaticClutter(np.inf, None, PERIOD)
-    assert static_clutter.look(d, own(0.0), 0.0, sender).tolist() == [True] * 5 + [False]
+    assert static_clutter.update(d, own(0.0), 0.0, sender).tolist() == [True] * 5 + [False]
     np.testing.assert_allclose(static_clutter.state.echoes[:, 1:4], WALL, atol=1e-9)
 
 
@@ -182,7 +182,7 @@ def test_two_uavs_that_hover_near_each_other_are_no_crowd():
     for frame in range(30):
         time = 0.03 * frame
         d = seen(time, [(8.0, 24.0, 4.0), (-1.7, 27.0, 6.0)])
-        assert not static_clutter.look(d, own(time), time).any()
+        assert not static_clutter.update(d, own(time), time).any()
 
 
 def above(d: Detections, snr: list[float]) -> Detections:
@@ -195,7 +195,7 @@ def test_a_uav_that_stands_out_of_a_wall_by_ten_decibels_is_none_of_it(snr, crow
     place is held to the same. Planted bugs: strength ignored; the wall's echoes spared too."""
     place = (0.0, 28.0, 6.0)
     static_clutter = StaticClutter(1.71, None, PERIOD)
-    found = static_clutter.look(above(seen(0.0, [*WALL, place]), [40.0] * 5 + [snr]), own(0.0), 0.0)
+    found = static_clutter.update(above(seen(0.0, [*WALL, place]), [40.0] * 5 + [snr]), own(0.0), 0.0)
     assert found.tolist() == [True] * 5 + [crowd]
     state = Gaussian(np.array([*place, *np.zeros(6)]), np.diag([0.01] * 3 + [0.09] * 3 + [9.0] * 3))
     assert static_clutter.holds(Track(1, state, snr)) is crowd
@@ -207,7 +207,7 @@ def test_what_stands_out_by_ten_decibels_makes_no_crowd_of_the_weaker(snr, crowd
     of which the brightest is no part of a surface that the UAV could be of. Planted bug: the
     strength of those beside it ignored."""
     places = [(0.0, 28.0, 6.0), (-4.0, 29.0, 7.0), (3.0, 30.0, 9.0), (-2.0, 24.0, 4.0)]
-    found = StaticClutter(1.71, None, PERIOD).look(
+    found = StaticClutter(1.71, None, PERIOD).update(
         above(seen(0.0, places), [40.0, 40.0, 40.0, snr]), own(0.0), 0.0
     )
     assert found[:3].tolist() == [crowd] * 3
@@ -221,7 +221,7 @@ def test_what_touches_the_mesh_does_not_stand_out(height, crowd):
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     ground = CityMesh("ground", corners, faces, np.zeros(2, np.int16), (), np.zeros(3))
     d = above(seen(0.0, [*WALL, (0.0, 28.0, height)]), [40.0] * 5 + [4000.0])
-    found = StaticClutter(1.71, Walls(ground), PERIOD).look(d, own(0.0), 0.0)
+    found = StaticClutter(1.71, Walls(ground), PERIOD).update(d, own(0.0), 0.0)
     assert found.tolist() == [True] * 5 + [crowd]
 
 
@@ -229,7 +229,7 @@ def test_a_line_of_sight_is_no_echo():
     """Planted bug: a passive terminal's reference remembered."""
     static_clutter = StaticClutter(1.71, None, PERIOD)
     d = seen(0.0, WALL)
-    static_clutter.look(Detections(**{**vars(d), "is_reference": np.ones(5, bool)}), own(0.0), 0.0)
+    static_clutter.update(Detections(**{**vars(d), "is_reference": np.ones(5, bool)}), own(0.0), 0.0)
     assert len(static_clutter.state.echoes) == 0
 
 
@@ -257,7 +257,7 @@ def test_what_stands_still_on_a_face_is_the_face(height, velocity, std, expected
     static_clutter = StaticClutter(1.71, ground(), PERIOD)
     d = seen(0.0, [(0.0, 30.0, height)], [velocity])
     d = Detections(**{**vars(d), "std": np.array([[0.01, 0.01, std, std]])})
-    assert static_clutter.look(d, own(0.0), 0.0).tolist() == [expected]
+    assert static_clutter.update(d, own(0.0), 0.0).tolist() == [expected]
     if expected:
         assert len(static_clutter.state.echoes) == 1
 
