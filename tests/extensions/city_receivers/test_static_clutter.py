@@ -195,7 +195,9 @@ def test_a_uav_that_stands_out_of_a_wall_by_ten_decibels_is_none_of_it(snr, crow
     place is held to the same. Planted bugs: strength ignored; the wall's echoes spared too."""
     place = (0.0, 28.0, 6.0)
     static_clutter = StaticClutter(1.71, None, PERIOD)
-    found = static_clutter.update(above(seen(0.0, [*WALL, place]), [40.0] * 5 + [snr]), own(0.0), 0.0)
+    found = static_clutter.update(
+        above(seen(0.0, [*WALL, place]), [40.0] * 5 + [snr]), own(0.0), 0.0
+    )
     assert found.tolist() == [True] * 5 + [crowd]
     state = Gaussian(np.array([*place, *np.zeros(6)]), np.diag([0.01] * 3 + [0.09] * 3 + [9.0] * 3))
     assert static_clutter.holds(Track(1, state, snr)) is crowd
@@ -229,7 +231,9 @@ def test_a_line_of_sight_is_no_echo():
     """Planted bug: a passive terminal's reference remembered."""
     static_clutter = StaticClutter(1.71, None, PERIOD)
     d = seen(0.0, WALL)
-    static_clutter.update(Detections(**{**vars(d), "is_reference": np.ones(5, bool)}), own(0.0), 0.0)
+    static_clutter.update(
+        Detections(**{**vars(d), "is_reference": np.ones(5, bool)}), own(0.0), 0.0
+    )
     assert len(static_clutter.state.echoes) == 0
 
 
