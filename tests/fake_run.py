@@ -194,6 +194,7 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
                     kind=np.array([1]),
                     target=np.array([2]),
                     uav=np.array([2 if see[2] else -1]),
+                    false=np.array([not see[2]]),
                 ),
                 state=int(f > 0),
                 hit=see & (f != 5),
@@ -203,10 +204,7 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
                 cooperative=np.array([True, True, False]),
                 genie=np.where(see, 0.97, np.nan),
                 clutter_free=np.where(see, 0.83, np.nan),
-                gospa=Gospa(
-                    np.sqrt(0.09 + 12.5), 0.09, 12.5 * (see.sum() - 1), 12.5 * (not see[2])
-                ),
-                gospa_targets=Gospa(0.3, 0.09, 0.0, 12.5 * (not see[2])),
+                gospa=Gospa(0.3, 0.09, 0.0, 12.5 * (not see[2])),
                 detection_kind=np.array([1, 3, -1, 4][:detections])
                 if detections
                 else np.zeros(0, int),

@@ -725,7 +725,7 @@ OF_TESTS = (
         ),
     ),
     (
-        "test_scoring::test_gospa_is_of_confirmed_tracks_and_uavs_in_view",
+        "test_scoring::test_gospa_is_of_confirmed_tracks_and_targets_in_view",
         Bug("results/scoring.py", "get(track, [-1, -1, -1])", "get(track, [0, 0, 0])"),
     ),
     (

@@ -146,12 +146,7 @@ NAMES = {"targets": "UAV", "links": "LINK"}
 ELSEWHERE = {
     "rmse_tracked",
     "counts",
-    "apart.targets.gospa",
-    *(
-        f"apart.{group}.{key}"
-        for group in ("targets", "terminals")
-        for key in ("bounds", "rmse", "rmse_tracked", "losses")
-    ),
+    "cooperative",
     "targets.UAV.median",
     "targets.UAV.p90",
     "targets.UAV.bound_median",

@@ -215,7 +215,7 @@ def _say_summary(results: Results) -> None:
         *(
             table(summary, group)
             for group in ("targets", "terminals")
-            for table in (tables.hit_table, tables.rmse_table)
+            for table in (tables.hit_table, tables.bound_table, tables.rmse_table)
         ),
         tables.side_by_side(summary),
     )
@@ -224,10 +224,9 @@ def _say_summary(results: Results) -> None:
             say_table(table.columns, table.rows)
             say("")
     for name, block in summary["links"].items():
-        targets = block["apart"]["targets"]
         _say_causes(
-            f"{tables.link_words(name)}: of {targets['in_view']} target-frames in view",
-            targets["losses"],
+            f"{tables.link_words(name)}: of {block['in_view']} target-frames in view",
+            block["losses"],
         )
         _say_causes(
             f"{tables.link_words(name)}: of {tables.number(block['false_tracks_per_frame'])} false "

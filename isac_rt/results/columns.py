@@ -62,6 +62,10 @@ def _number(meaning: str, source: str | Callable[[Any], Any], dtype: type, **mor
     return Column(dtype, DIMENSIONLESS, meaning, source, **more)
 
 
+def _of_uavs(meaning: str, source: str) -> Column:
+    return _number(meaning, source, float, dims=("uav",), missing=np.nan)
+
+
 def _found_sparse(o: ObserverRecord) -> int:
     return -1 if o.reception.sparse is None else int(o.reception.sparse)
 
@@ -135,48 +139,35 @@ OBSERVERS: dict[str, Column] = {
         dims=("uav",),
         missing=-1,
     ),
-    "target_snr": _number(
+    "target_snr": _of_uavs(
         "SNR of the UAV's own path behind a matched filter over samples, chirps and antennas",
         "target_snr",
-        float,
-        dims=("uav",),
-        missing=np.nan,
     ),
-    "target_clutter": _number(
+    "target_clutter": _of_uavs(
         "power of the diffuse paths in the UAV's cell over the noise of one channel's map",
         "target_clutter",
-        float,
-        dims=("uav",),
-        missing=np.nan,
     ),
-    "cooperative": _number("UAV that is a terminal", "cooperative", bool, dims=("uav",)),
-    "genie": _number(
-        "probability that a matched filter at the true parameters finds the UAV's own path",
-        "genie",
-        float,
-        dims=("uav",),
-        missing=np.nan,
+    "cooperative": _number(
+        "UAV that is a terminal and reports its position", "cooperative", bool, dims=("uav",)
     ),
-    "clutter_free": _number(
-        "probability that the receiver's detector would find the UAV in noise alone",
-        "clutter_free",
-        float,
-        dims=("uav",),
-        missing=np.nan,
+    "genie": _of_uavs(
+        "probability that a matched filter at the true parameters finds the UAV's own path", "genie"
+    ),
+    "clutter_free": _of_uavs(
+        "probability that the receiver's detector would find the UAV in noise alone", "clutter_free"
     ),
     **{
-        f"{of}_{part}": Column(
+        f"gospa_{part}": Column(
             float,
             "m2",
-            f"{words} in the square of the GOSPA distance of the confirmed tracks{but}",
-            f"{of}.{part}",
+            f"{words} in the square of the GOSPA distance of confirmed tracks from targets",
+            f"gospa.{part}",
             missing=np.nan,
         )
-        for of, but in (("gospa", ""), ("gospa_targets", ", terminals left out"))
         for part, words in (
             ("localisation", "errors of position"),
-            ("missed", "UAVs without a track"),
-            ("false", "tracks without a UAV"),
+            ("missed", "targets without a track"),
+            ("false", "tracks without a target"),
         )
     },
     "processed": _number("the observer processed the frame", lambda o: True, bool),
@@ -331,6 +322,9 @@ TRACKS: dict[str, Column] = {
         np.int16,
     ),
     "uav": _number("index of the UAV in view that it follows, -1: none", "tracks.uav", np.int16),
+    "false": _number(
+        "confirmed, follows no UAV and is 5 m or more from every one", "tracks.false", bool
+    ),
 }
 
 
@@ -348,22 +342,19 @@ PICTURES: dict[str, Column] = {
         np.nan,
     ),
     "seen": _number("target in view of a terminal", "seen", bool, dims=("uav",)),
-    "found": _number(
-        "target in view with a fused track that its echo updates", "found", bool, dims=("uav",)
+    "found": _number("target found by a terminal", "found", bool, dims=("uav",)),
+    "tracked": _number(
+        "target with a fused track within 5 m and three resolutions", "tracked", bool, dims=("uav",)
     ),
     "error": _number(
-        "errors of targets found: position [m], velocity [m s-1], normalised squared position "
+        "errors of targets tracked: position [m], velocity [m s-1], normalised squared position "
         "error over its axes",
         "error",
         float,
         dims=("uav", "measure"),
         missing=np.nan,
     ),
-    "false": _number("fused tracks of no UAV", "false", np.int32),
-    "hidden": _number("fused tracks of a target outside every view", "hidden", np.int32),
-    "unrecognised": _number(
-        "fused tracks of a terminal that is not recognised", "unrecognised", np.int32
-    ),
+    "false": _number("fused tracks 5 m or more from every UAV", "false", np.int32),
     "reports": _number("tracks or detections of others that are used", "reports", np.int32),
     "age": Column(float, "s", "mean age of the reports of others", "age", missing=np.nan),
     "messages": _number("messages that ended in the frame", "messages", np.int32),
@@ -398,7 +389,7 @@ FUSED: dict[str, Column] = {
     "terminal": _number(
         "index of the UAV of the swarm that it is recognised as, -1: none", "terminal", np.int16
     ),
-    "uav": _number("index of the target that it is found as, -1: none", "uav", np.int16),
+    "uav": _number("index of the target that it tracks, -1: none", "uav", np.int16),
 }
 """UAVs of the set of fused tracks."""
 

@@ -11,8 +11,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.special import betaincinv
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, resolutions
 from isac_rt.frame.payload import Payload
+from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Reception
 from isac_rt.world.swarm import Pose
 
@@ -52,6 +53,32 @@ def truth_of(observer: Pose, uav: Pose, at: Pose | None = None) -> Truth:
         velocity += float(outward @ (uav.velocity - at.velocity)) / further
     right, ahead, up = body.tolist()
     return Truth(length, velocity, right, up, atan2(right, ahead), asin(min(max(up, -1.0), 1.0)))
+
+
+GATE_RESOLUTIONS = 3.0
+"""An estimate farther from a UAV than so many resolutions on some axis does not stand for it, even
+if the UAV's own path caused it: an alias, a range misread, a track that has drifted off."""
+
+
+class Resolution(NamedTuple):
+    """Resolution of a link's receiver: of range [m], velocity [m/s] and direction cosines (4,), and
+    whether it observes u_x and u_z."""
+
+    width: np.ndarray
+    observed: tuple[bool, bool]
+
+    @classmethod
+    def of(cls, waveform: Waveform, antennas: Antennas, passes: int) -> Resolution:
+        """Return the resolution for an echo in one-way range (passes = 2) or for a path length."""
+        return cls(resolutions(waveform, antennas, passes), antennas.observes(passes))
+
+    def off(self, truth: Truth, points: np.ndarray) -> np.ndarray:
+        """(Q,) largest distance of points (Q, 4) from the truth on any axis in resolutions; a
+        direction that was not found counts as `GATE_RESOLUTIONS`, one that is not observed not at
+        all."""
+        off = np.abs(points - np.array(truth[:4])) / self.width
+        off[:, 2:][:, np.logical_not(self.observed)] = 0.0
+        return np.where(np.isnan(off), GATE_RESOLUTIONS, off).max(axis=1)
 
 
 @dataclass(frozen=True)
@@ -137,14 +164,42 @@ def gospa(truths: np.ndarray, estimates: np.ndarray, cutoff: float) -> Gospa:
        doi:10.23919/ICIF.2017.8009645
     """
     x, y = np.asarray(truths, float), np.asarray(estimates, float)
-    square, pairs = 0.0, 0
-    if len(x) and len(y):
-        d2 = np.minimum(np.sum((x[:, None] - y[None]) ** 2, axis=-1), cutoff**2)
-        rows, columns = linear_sum_assignment(d2)
-        chosen = d2[rows, columns]
-        square, pairs = float(chosen[chosen < cutoff**2].sum()), int((chosen < cutoff**2).sum())
+    distance = np.linalg.norm(x[:, None] - y[None], axis=-1)
+    paired = assigned(distance, cutoff)
+    square, pairs = float(sum(distance[pair] ** 2 for pair in paired)), len(paired)
     missed, false = (len(x) - pairs) * cutoff**2 / 2, (len(y) - pairs) * cutoff**2 / 2
     return Gospa(float(np.sqrt(square + missed + false)), square, missed, false)
+
+
+def assigned(distance: np.ndarray, limit: float) -> list[tuple[int, int]]:
+    """Return the pairs of rows and columns (n, m) with the least sum of squared distances, each
+    clipped at `limit`; a row or column that is `limit` or more from its partner has none."""
+    rows, columns = linear_sum_assignment(np.minimum(distance, limit) ** 2)
+    near = distance[rows, columns] < limit
+    return list(zip(rows[near].tolist(), columns[near].tolist(), strict=True))
+
+
+def score_tracks(
+    tracks: np.ndarray, uavs: np.ndarray, scored: np.ndarray
+) -> tuple[Gospa, np.ndarray]:
+    """Return GOSPA of tracks against the UAVs that are scored, and which tracks are
+    `GOSPA_CUTOFF_M` or more from every UAV.
+
+    Tracks are assigned to all UAVs together. A track assigned to a UAV that is not scored, or left
+    within the cutoff of one, is no error: it stands for a terminal, which reports its position, or
+    for a target that is occluded now.
+
+    Parameters
+    ----------
+    tracks, uavs : (T, 3), (U, 3) positions [m]
+    scored : (U,) bool, the targets in view
+    """
+    distance = np.linalg.norm(tracks[:, None] - uavs[None], axis=-1)
+    near = distance < GOSPA_CUTOFF_M
+    other = near[:, ~scored].any(axis=1)
+    for track, uav in assigned(distance, GOSPA_CUTOFF_M):
+        other[track] = not scored[uav]
+    return gospa(uavs[scored], tracks[~other], GOSPA_CUTOFF_M), ~near.any(axis=1)
 
 
 def decibels(ratio: float) -> float | None:

@@ -42,10 +42,12 @@ class Results:
         lines = [f"<Results of {self.scenario.name}: {self.summary['frames']} frames, seed "]
         lines[0] += str(self.summary["seed"])
         for name, block in self.summary["terminals"].items():
-            targets = block["apart"]["targets"]
-            hits = f"{text(targets['hit_rate'], '.2f')} (n = {targets['in_view']})"
+            found, tracked = (text(block[key], ".2f") for key in ("hit_rate", "tracked_rate"))
             delay, dpsk = (text(block[key], ".2e") for key in ("ser_delay", "ser_dpsk"))
-            lines.append(f"  {name}: hit rate of targets {hits}, SER delay {delay}, DPSK {dpsk}")
+            lines.append(
+                f"  {name}: targets found {found}, tracked {tracked} (n = {block['in_view']}), "
+                f"SER delay {delay}, DPSK {dpsk}"
+            )
         return "\n".join(lines) + ">"
 
 

@@ -46,6 +46,7 @@ class TrackTable:
     kind, target : of the path that explains the latest detection that updated it: `PathKind` and
         index of the UAV involved, -1: none
     uav : index of the UAV in view that it follows (`isac_rt.results.scoring`), -1: none
+    false : confirmed, follows no UAV and is at least the cutoff of GOSPA from every one
     """
 
     id: np.ndarray
@@ -59,6 +60,7 @@ class TrackTable:
     kind: np.ndarray
     target: np.ndarray
     uav: np.ndarray
+    false: np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,13 +84,13 @@ class ObserverRecord:
     target_snr : (U,) SNR of its own path behind a matched filter that is coherent over the whole
         frame (linear), NaN where it is not in view or shadowed
     target_clutter : (U,) power of the clutter in its cell over the noise (linear), likewise
-    cooperative : (U,) bool; whether a UAV is a terminal in this frame, which says where it is
+    cooperative : (U,) bool; terminals, which report their position; none in a swarm of terminals
+        alone, whose terminals are its targets
     genie : (U,) probability that a matched filter at the true parameters finds its own path, NaN
         where it is not in view or shadowed
     clutter_free : (U,) probability that the receiver's detector would find it in noise alone,
         likewise
-    gospa : of the confirmed tracks against the UAVs in view and unshadowed
-    gospa_targets : the same without terminals and the tracks that their own paths feed
+    gospa : of the confirmed tracks against the targets in view and unshadowed
     detection_kind, detection_target, detection_order, detection_face, detection_sidelobe : (Q,)
         what explains each detection, as `isac_rt.results.labels.Explanation` says, targets as
         indices of UAVs
@@ -122,7 +124,6 @@ class ObserverRecord:
     genie: np.ndarray
     clutter_free: np.ndarray
     gospa: Gospa
-    gospa_targets: Gospa
     detection_kind: np.ndarray
     detection_target: np.ndarray
     detection_order: np.ndarray
@@ -161,14 +162,14 @@ class FusedRecord:
 
     Attributes
     ----------
-    gospa : (3,) localisation, missed, false [m^2], over targets in view of anyone and UAVs that
-        are nobody's of the swarm
-    seen, found : (U,) bool; a target in view of a link's receiver when it last received; one that a
-        body stands for which the target's own echo feeds
-    error : (U, 3) of those found: position [m], velocity [m/s], squared error of position in the
+    gospa : (3,) localisation, missed, false [m^2], over targets in view of anyone
+    seen, found : (U,) bool; a target that a link's receiver had in view, and found, when it last
+        received
+    tracked : (U,) bool; a fused track is within the cutoff of GOSPA and within three resolutions of
+        a link that has the target in view
+    error : (U, 3) of those tracked: position [m], velocity [m/s], squared error of position in the
         deviations stated over its axes
-    false, hidden, unrecognised : UAVs that stand for nobody, for a target in nobody's view, and
-        for a terminal that is not recognised
+    false : fused tracks at least the cutoff of GOSPA from every UAV
     reports, age : what was received from others and counts, and its mean age [s]
     messages, lost : that reached the terminal in this frame, and those of them that were lost
     late : earlier ones, lost until then, that came with a frame that was read late
@@ -178,16 +179,15 @@ class FusedRecord:
     mean, std : (B, 6) position and velocity in world axes [m, m/s]
     members : (B,) how many tracks are taken for it
     terminal : (B,) index of the UAV of the swarm that it is recognised as, -1: none
-    uav : (B,) index of the target that it is found as, -1: none
+    uav : (B,) index of the target that it tracks, -1: none
     """
 
     gospa: np.ndarray
     seen: np.ndarray
     found: np.ndarray
+    tracked: np.ndarray
     error: np.ndarray
     false: int
-    hidden: int
-    unrecognised: int
     reports: int
     age: float
     messages: int

@@ -1,8 +1,7 @@
 """A terminal's frame held against the truth.
 
-Every detection and every track is judged by the path that caused it, never by what happens to lie
-near: a UAV is found by a detection that its own path explains, and followed by a track whose latest
-detection its own path explains.
+A UAV is found by a detection that its own path explains, and tracked by a confirmed track within
+three resolutions of it. Errors are those of detections and tracks that its own path caused.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas, azimuth_elevation, resolutions
+from isac_rt.frame.antennas import Antennas, azimuth_elevation
 from isac_rt.frame.cube import Transmission
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
@@ -23,11 +22,13 @@ from isac_rt.results.bounds import CramerRao
 from isac_rt.results.labels import Aim, Places, explain, owners
 from isac_rt.results.losses import Chance, Sensitivity, cause_of
 from isac_rt.results.metrics import (
-    GOSPA_CUTOFF_M,
+    GATE_RESOLUTIONS,
+    Resolution,
     SymbolCount,
     Truth,
+    assigned,
     count_symbols,
-    gospa,
+    score_tracks,
     truth_of,
     within_view,
 )
@@ -36,9 +37,6 @@ from isac_rt.track.parts import Late
 from isac_rt.track.tracker import TrackSet
 from isac_rt.world.swarm import Swarm
 
-GATE_RESOLUTIONS = 3.0
-"""An estimate farther from a UAV than so many resolutions on some axis does not stand for it, even
-if the UAV's own path caused it: an alias, a range misread, a track that has drifted off."""
 MISREAD = 0.5
 """Share of wrong delay symbols from which on a data frame shows nothing in its place."""
 
@@ -77,8 +75,7 @@ class Scorer(Stateful):
     ) -> None:
         self.link, self._antennas, self._swarm, self._timetable = link, antennas, swarm, timetable
         self._passes = 2 if link[0] == link[1] else 1
-        self._resolution = resolutions(timetable.waveform, antennas, self._passes)
-        self._observed = antennas.observes(self._passes)
+        self._resolution = Resolution.of(timetable.waveform, antennas, self._passes)
         self._least = CramerRao.of(timetable.waveform, antennas, self._passes)
         self._receivers = receivers
         self.state = Remembered()
@@ -106,8 +103,11 @@ class Scorer(Stateful):
         sees = self._sensitivity(frame, sent, noise_power)
         labels = self._labels_of(reception.detections, paths, sees, view.directions)
         best, hit = self._found(view, reception.detections, labels.uav)
-        table = self._table(view, tracks, labels)
-        followed = {int(i): int(k) for k, i in enumerate(table.uav) if i >= 0}
+        reported = self._reported(frame)
+        seen = np.isin(np.arange(len(hit)), list(view.seen))
+        confirmed = tracks.mean[tracks.confirmed, :3]
+        distance, false = score_tracks(confirmed, view.positions, seen & ~reported)
+        table, caused = self._table(view, tracks, labels, false)
         symbols = SymbolCount()
         if self._passes == 1:
             symbols = count_symbols(sent.payload, reception, timetable.groups(self.link))
@@ -120,14 +120,15 @@ class Scorer(Stateful):
             own = bool((labels.uav == i).any())
             loss[i] = cause_of(bool(hit[i]), own, beside, chance, sees, read)
         raw = reception.raw_delay_symbols
-        friends = np.array([role != "target" for role in timetable.roles(frame).values()])
         return ObserverRecord(
             transmitter=self.link.tx,
             reception=reception,
             paths=paths,
             truth=_values([None if t is None else np.array(t)[[0, 1, 4, 5]] for t in view.truth]),
-            detected=_estimates(len(hit), reception.detections.measured, best, self._observed),
-            tracked=_estimates(len(hit), tracks.measured, followed, self._observed),
+            detected=_estimates(
+                len(hit), reception.detections.measured, best, self._resolution.observed
+            ),
+            tracked=_estimates(len(hit), tracks.measured, caused, self._resolution.observed),
             in_view=view.inside,
             shadowed=view.inside & ~view.direct,
             tracks=table,
@@ -137,17 +138,12 @@ class Scorer(Stateful):
             bound=self._bound(view, chances),
             target_snr=_by_uav({i: c.matched for i, c in chances.items()}, len(hit)),
             target_clutter=_by_uav({i: c.clutter for i, c in chances.items()}, len(hit)),
-            cooperative=friends,
+            cooperative=reported,
             genie=_by_uav({i: sees.genie(c.matched) for i, c in chances.items()}, len(hit)),
             clutter_free=_by_uav(
                 {i: sees.clutter_free(c.cell) for i, c in chances.items()}, len(hit)
             ),
-            gospa=gospa(view.places, tracks.mean[tracks.confirmed, :3], GOSPA_CUTOFF_M),
-            gospa_targets=gospa(
-                view.places[~friends[list(view.seen)]],
-                tracks.mean[tracks.confirmed & ~self._of_friends(tracks, friends), :3],
-                GOSPA_CUTOFF_M,
-            ),
+            gospa=distance,
             **{f"detection_{name}": value for name, value in vars(labels).items() if name != "uav"},
             symbols=symbols,
             latency=0 if reception.decoded else -1,
@@ -189,9 +185,16 @@ class Scorer(Stateful):
         straight[some] = own_paths[some]
         direct = np.isin(np.arange(len(names)), straight[some])
         seen = {i: t for i, t in enumerate(truth) if t is not None and inside[i] and direct[i]}
-        everyone = np.array([poses[name].position - own.position for name in names])
+        positions = np.array([poses[name].position - own.position for name in names])
         directions = own.to_body(paths.arrival)[:, ::2]
-        return _View(truth, inside, direct, straight, seen, everyone[list(seen)], directions)
+        return _View(truth, inside, direct, straight, seen, positions, directions)
+
+    def _reported(self, frame: int) -> np.ndarray:
+        """(U,) UAVs that are terminals in a frame and report their position; none in a swarm of
+        terminals alone, whose terminals are its targets."""
+        roles = [self._timetable.roles(frame), self._timetable.first_roles]
+        now, first = (np.array([role != "target" for role in of.values()]) for of in roles)
+        return now & ~first.all()
 
     def _sensitivity(self, frame: int, sent: Transmission, noise_power: float) -> Sensitivity:
         timetable = self._timetable
@@ -210,7 +213,7 @@ class Scorer(Stateful):
     def _labels_of(
         self, d: Detections, paths: PathSet, sees: Sensitivity, directions: np.ndarray
     ) -> _Labels:
-        beam = np.where(self._observed, self._resolution[2:], np.inf)
+        beam = np.where(self._resolution.observed, self._resolution.width[2:], np.inf)
         aim = Aim(directions, beam)
         found = explain(d, paths, self._timetable.waveform, self._passes, sees.cell, aim)
         names = list(self._swarm.uavs)
@@ -221,13 +224,6 @@ class Scorer(Stateful):
             uav=np.where(found.sidelobe, -1, uav),
         )
 
-    def _off(self, truth: Truth, points: np.ndarray) -> np.ndarray:
-        """(Q,) largest distance on any axis in resolutions; a direction that was not found counts
-        as `GATE_RESOLUTIONS`, one that is not observed not at all."""
-        off = np.abs(points - np.array(truth[:4])) / self._resolution
-        off[:, 2:][:, np.logical_not(self._observed)] = 0.0
-        return np.where(np.isnan(off), GATE_RESOLUTIONS, off).max(axis=1)
-
     def _found(
         self, view: _View, d: Detections, uav: np.ndarray
     ) -> tuple[dict[int, int], np.ndarray]:
@@ -235,16 +231,25 @@ class Scorer(Stateful):
         whether it is within one resolution on all axes."""
         best, hit = {}, np.zeros(len(view.truth), bool)
         for i, truth in view.seen.items():
-            off = np.where(uav == i, self._off(truth, d.measured), np.inf)
+            off = np.where(uav == i, self._resolution.off(truth, d.measured), np.inf)
             if off.size and off.min() <= GATE_RESOLUTIONS:
                 best[i] = int(off.argmin())
                 hit[i] = off.min() <= 1
         return best, hit
 
-    def _table(self, view: _View, tracks: TrackSet, labels: _Labels) -> TrackTable:
-        """The tracks, with what explains them and whom they follow: a UAV is followed by one
-        confirmed track within the gate whose latest detection its own path explains, the one that
-        followed it last if there are several."""
+    def _table(
+        self, view: _View, tracks: TrackSet, labels: _Labels, false: np.ndarray
+    ) -> tuple[TrackTable, dict[int, int]]:
+        """Return the tracks with what explains them and whom they follow, and the rows of those
+        that follow the UAV whose own path explains their latest detection.
+
+        Confirmed tracks within the gate are assigned to UAVs one to one, a UAV to the track that
+        followed it last before others.
+
+        Parameters
+        ----------
+        false : of the confirmed tracks, those far from every UAV
+        """
         columns = np.column_stack([labels.kind, labels.target, labels.uav])
         for track, row in zip(tracks.ids.tolist(), tracks.detection.tolist(), strict=True):
             if row >= 0:
@@ -252,15 +257,21 @@ class Scorer(Stateful):
         mine = {track: self.state.labels.get(track, [-1, -1, -1]) for track in tracks.ids.tolist()}
         self.state.labels = mine
         kind, target, uav = np.array([*mine.values()], int).reshape(-1, 3).T
-        follows = np.full(len(tracks), -1)
-        for i, truth in view.seen.items():
-            off = self._off(truth, tracks.measured)
-            able = (uav == i) & tracks.confirmed & (off <= GATE_RESOLUTIONS)
-            if able.any():
-                rank = np.where(tracks.ids == self.state.followed.get(i), -1.0, off)
-                best = int(np.argmin(np.where(able, rank, np.inf)))
-                follows[best], self.state.followed[i] = i, int(tracks.ids[best])
-        return TrackTable(
+        follows, rows = np.full(len(tracks), -1), np.flatnonzero(tracks.confirmed)
+        off = np.array(
+            [self._resolution.off(truth, tracks.measured[rows]) for truth in view.seen.values()]
+        )
+        off = off.reshape(len(view.seen), len(rows))
+        last = np.array([self.state.followed.get(i, -1) for i in view.seen], int)
+        stays = (tracks.ids[rows] == last[:, None]) & (off < GATE_RESOLUTIONS)
+        cost = np.where(stays, 0.0, (off + GATE_RESOLUTIONS) / 2)
+        for i, k in assigned(cost, GATE_RESOLUTIONS):
+            u, row = list(view.seen)[i], rows[k]
+            follows[row], self.state.followed[u] = u, int(tracks.ids[row])
+        own = {int(follows[k]): int(k) for k in rows if 0 <= follows[k] == uav[k]}
+        of_nobody = np.zeros(len(tracks), bool)
+        of_nobody[rows] = false & (follows[rows] < 0)
+        table = TrackTable(
             id=tracks.ids,
             range=tracks.range,
             velocity=tracks.velocity,
@@ -272,12 +283,9 @@ class Scorer(Stateful):
             kind=kind,
             target=target,
             uav=follows,
+            false=of_nobody,
         )
-
-    def _of_friends(self, tracks: TrackSet, friends: np.ndarray) -> np.ndarray:
-        """(K,) which tracks a terminal's own path fed last; the reference is one."""
-        uav = np.array([self.state.labels[track][-1] for track in tracks.ids.tolist()], int)
-        return tracks.is_reference | (np.append(friends, False)[uav])
+        return table, own
 
     def _chances(self, view: _View, paths: PathSet, sees: Sensitivity) -> dict[int, Chance]:
         """Return the detection chance of the strongest straight path of each UAV seen."""
@@ -315,7 +323,7 @@ class _View:
     direct : (U,) reached straight, without the city
     straight : (K,) index of the UAV whose own straight path each path is, -1: none's
     seen : the truth of those in view and unshadowed, by index
-    places : (S, 3) of these, relative to the receiver [m]
+    positions : (U, 3) relative to the receiver [m]
     directions : (K, 2) u_x, u_z from which each path arrives
     """
 
@@ -324,7 +332,7 @@ class _View:
     direct: np.ndarray
     straight: np.ndarray
     seen: dict[int, Truth]
-    places: np.ndarray
+    positions: np.ndarray
     directions: np.ndarray
 
 

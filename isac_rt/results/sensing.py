@@ -17,7 +17,7 @@ from isac_rt.results.losses import LOSSES
 from isac_rt.results.metrics import GOSPA_CUTOFF_M, SymbolCount
 from isac_rt.results.records import KINDS
 
-RATES = ("ser_delay", "ser_dpsk", "ber", "hit_rate")
+RATES = ("ser_delay", "ser_dpsk", "ber", "hit_rate", "tracked_rate")
 """Shares of a summary that have a numerator and a denominator."""
 ERROR_KEYS = tuple(key for _, key in MEASURES.values())
 FALSE_CAUSES = (*KINDS, "noise")
@@ -34,6 +34,7 @@ class Sensing:
     hidden : (F, U) bool, in view but shadowed
     hit : (F, U) bool
     detected, tracked : (F, U, 4) errors [m, m/s, deg, deg], NaN where there is no estimate
+    followed : (F, U) bool, a confirmed track is within three resolutions
     bound : (F, U, 4) their least standard deviations, NaN where it is not seen
     loss : (F, U) `Loss`, -1 where it is not seen
     switched : (F, U) bool, another track follows it than the last that did
@@ -41,9 +42,9 @@ class Sensing:
     cooperative : (F, U) bool, terminals
     genie, clutter_free : (F, U) probabilities of detection by a matched filter at the true
         parameters, and by the receiver's detector in noise alone
-    gospa, gospa_targets : (F, 3) localisation, missed, false [m^2]; of all, and without terminals
+    gospa : (F, 3) localisation, missed, false [m^2] of targets
     num_false, num_clutter : (F,) detections
-    false_tracks : (F, kinds + 1) confirmed tracks that follow no UAV in view, by `FALSE_CAUSES`
+    false_tracks : (F, kinds + 1) confirmed tracks far from every UAV, by `FALSE_CAUSES`
     ghosts : (F, U) those of them that ghosts of each UAV feed
     """
 
@@ -52,6 +53,7 @@ class Sensing:
     hit: np.ndarray
     detected: np.ndarray
     tracked: np.ndarray
+    followed: np.ndarray
     bound: np.ndarray
     loss: np.ndarray
     switched: np.ndarray
@@ -60,7 +62,6 @@ class Sensing:
     genie: np.ndarray
     clutter_free: np.ndarray
     gospa: np.ndarray
-    gospa_targets: np.ndarray
     num_false: np.ndarray
     num_clutter: np.ndarray
     false_tracks: np.ndarray
@@ -88,16 +89,13 @@ class Sensing:
             in_units = [np.rad2deg(e) if MEASURES[n][0] == "rad" else e for n, e in found.items()]
             return np.stack(in_units, axis=-1)
 
-        def parts(of: str) -> np.ndarray:
-            return np.stack([values[f"{of}_{part}"] for part in PARTS], axis=-1)
-
         def counted(what: np.ndarray, of: np.ndarray, most: int) -> np.ndarray:
             """Count the tracks of each number under `most`, frame by frame."""
             out = np.zeros((count, most), int)
             np.add.at(out, (frame[of], what[of]), 1)
             return out
 
-        false = (tracks["confirmed"] > 0) & (tracks["uav"] < 0)
+        false = tracks["false"] > 0
         kind, ghost_of = tracks["kind"], tracks["target"]
         ghost = false & (kind == PathKind.GHOST) & (ghost_of >= 0)
         return cls(
@@ -106,14 +104,14 @@ class Sensing:
             np.array(values["hit"]),
             errors("detected"),
             errors("tracked"),
+            counted(tracks["uav"], tracks["uav"] >= 0, num_uavs) > 0,
             errors("bound"),
             np.array(values["loss"]),
             *_breaks(tracks, frame, in_view & ~shadowed),
             np.array(values["cooperative"]),
             np.array(values["genie"]),
             np.array(values["clutter_free"]),
-            parts("gospa"),
-            parts("gospa_targets"),
+            np.stack([values[f"gospa_{part}"] for part in PARTS], axis=-1),
             np.array(values["num_false"]),
             np.array(values["num_clutter"]),
             counted(np.where(kind < 0, len(KINDS), kind), false, len(FALSE_CAUSES)),
@@ -133,33 +131,18 @@ class Sensing:
         return Sensing(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
     def block(self) -> dict[str, Any]:
-        """The keys of a terminal or link in `summary.json` that are of its fused tracks."""
-        frames, in_view = len(self.seen), int(self.seen.sum())
-        found = np.isfinite(self.detected[..., 0]) & self.seen
-        followed = np.isfinite(self.tracked[..., 0]) & self.seen
-        false = self.false_tracks.sum(axis=0)
+        """Summarise sensing under the keys of a terminal or link in `summary.json`."""
+        frames, false = len(self.seen), self.false_tracks.sum(axis=0)
         return {
-            "hit_rate": share(int(self.hit.sum()), in_view),
-            "bounds": self._bounds(self.seen),
-            "matched": share(int(found.sum()), in_view),
-            "matched_tracked": share(int(followed.sum()), in_view),
+            **self._scores(~self.cooperative),
+            "gospa": gospa_block(self.gospa, self.seen & ~self.cooperative),
             "false_per_frame": share(int(self.num_false.sum()), frames),
             "clutter_per_frame": share(int(self.num_clutter.sum()), frames),
-            "rmse": _by_axis(self.detected[found], rms),
-            "rmse_tracked": _by_axis(self.tracked[followed], rms),
-            "gospa": gospa_block(self.gospa, self.seen),
-            "apart": {
-                "targets": {
-                    **self._found(~self.cooperative),
-                    "gospa": gospa_block(self.gospa_targets, self.seen & ~self.cooperative),
-                },
-                "terminals": self._found(self.cooperative),
-            },
             "false_tracks_per_frame": share(int(false.sum()), frames),
             "false_tracks": {
                 name: share(int(n), frames) for name, n in zip(FALSE_CAUSES, false, strict=True)
             },
-            "losses": _counts(self.loss),
+            "cooperative": self._scores(self.cooperative),
         }
 
     def targets(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -169,13 +152,12 @@ class Sensing:
     def _target(self, i: int) -> dict[str, Any]:
         errors, least = self.detected[self.seen[:, i], i], self.bound[self.seen[:, i], i]
         least = np.where(np.isfinite(errors), least, np.nan)
-        followed = np.isfinite(self.tracked[self.seen[:, i], i, 0])
         return {
             "in_view": int(self.seen[:, i].sum()),
             "hidden": int(self.hidden[:, i].sum()),
             "found": int(self.hit[:, i].sum()),
             "detected": int(np.isfinite(errors[:, 0]).sum()),
-            "tracked": int(followed.sum()),
+            "tracked": int((self.followed & self.seen)[:, i].sum()),
             "switches": int(self.switched[:, i].sum()),
             "interruptions": int(self.resumed[:, i].sum()),
             "ghost_tracks": int(self.ghosts[:, i].sum()),
@@ -186,19 +168,29 @@ class Sensing:
             "losses": _counts(self.loss[:, i]),
         }
 
-    def _found(self, of: np.ndarray) -> dict[str, Any]:
-        """Count the target-frames in view of some of the UAVs (F, U) and those that were found,
-        and average the errors of their detections and tracks."""
+    def counts(self) -> dict[str, list[int]]:
+        """Return numerator and denominator of the targets' rates."""
+        seen = self.seen & ~self.cooperative
+        rates = {"hit_rate": self.hit, "tracked_rate": self.followed}
+        return {name: [int((of & seen).sum()), int(seen.sum())] for name, of in rates.items()}
+
+    def _scores(self, of: np.ndarray) -> dict[str, Any]:
+        """Score some of the UAVs (F, U) over the target-frames in view."""
         seen = self.seen & of
         detected, tracked = (
             np.isfinite(errors[..., 0]) & seen for errors in (self.detected, self.tracked)
         )
+        shares = {
+            "hit_rate": self.hit & seen,
+            "tracked_rate": self.followed & seen,
+            "matched": detected,
+            "matched_tracked": tracked,
+        }
+        in_view = int(seen.sum())
         return {
-            "in_view": int(seen.sum()),
-            "hit_rate": share(int((self.hit & seen).sum()), int(seen.sum())),
+            "in_view": in_view,
+            **{name: share(int(one.sum()), in_view) for name, one in shares.items()},
             "bounds": self._bounds(seen),
-            "detected": int(detected.sum()),
-            "tracked": int(tracked.sum()),
             "rmse": _by_axis(self.detected[detected], rms),
             "rmse_tracked": _by_axis(self.tracked[tracked], rms),
             "losses": _counts(self.loss[seen]),
@@ -309,12 +301,12 @@ def summary_block(
     """
     c = symbols or SymbolCount()
     receives = symbols is not None
-    counts = [
-        [c.delay_errors, c.delay_total],
-        [c.dpsk_errors, c.dpsk_total],
-        [c.bit_errors, c.bits_total],
-        [int(sensing.hit.sum()), int(sensing.seen.sum())],
-    ]
+    counts = {
+        "ser_delay": [c.delay_errors, c.delay_total],
+        "ser_dpsk": [c.dpsk_errors, c.dpsk_total],
+        "ber": [c.bit_errors, c.bits_total],
+        **sensing.counts(),
+    }
     return {
         "role": role,
         "ser_dpsk": share(c.dpsk_errors, c.dpsk_total),
@@ -324,5 +316,5 @@ def summary_block(
         "bits": c.bits_decoded if receives else None,
         "bit_rate_bps": c.bits_decoded / duration if receives else None,
         **sensing.block(),
-        "counts": dict(zip(RATES, counts, strict=True)),
+        "counts": counts,
     }

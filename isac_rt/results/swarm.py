@@ -6,22 +6,29 @@ The swarm's own terminals are known by what they say of themselves and are not c
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
+from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
 from isac_rt.plain import Stateful
-from isac_rt.propagation.pathset import PathKind
+from isac_rt.results.columns import ERRORS
 from isac_rt.results.dataset import Columns
-from isac_rt.results.metrics import GOSPA_CUTOFF_M
+from isac_rt.results.metrics import (
+    GATE_RESOLUTIONS,
+    GOSPA_CUTOFF_M,
+    Resolution,
+    assigned,
+    score_tracks,
+    truth_of,
+)
 from isac_rt.results.records import FusedRecord, ObserverRecord
-from isac_rt.results.sensing import gospa_block
-from isac_rt.track.fused import Fused, Key
+from isac_rt.results.sensing import gospa_block, share
+from isac_rt.track.fused import Fused
 from isac_rt.world.swarm import Pose
 
 SWARM = "swarm"
@@ -73,18 +80,21 @@ class View:
 
 @dataclass
 class Remembered:
-    """UAVs (U,) that each link saw last, and the UAV that fed each track last, -1: none."""
+    """UAVs (U,) that each link had in view and found when it last received."""
 
     seen: dict[Link, np.ndarray] = field(default_factory=dict)
-    fed: dict[Key, int] = field(default_factory=dict)
+    found: dict[Link, np.ndarray] = field(default_factory=dict)
 
 
 class SwarmScorer(Stateful):
-    """Holds fused tracks against the truth. It remembers which UAVs each link saw last, and what
-    fed each track last."""
+    """Scores fused tracks. It remembers which UAVs each link saw and found last."""
 
-    def __init__(self, timetable: Timetable) -> None:
+    def __init__(self, timetable: Timetable, antennas: Antennas) -> None:
         self._timetable = timetable
+        self._resolutions = {
+            link: Resolution.of(timetable.waveform, antennas, 2 if link.own else 1)
+            for link in timetable.all_links
+        }
         self._origins = [str(link) for link in timetable.labels]
         self.state = Remembered()
 
@@ -103,56 +113,42 @@ class SwarmScorer(Stateful):
         observers : the frame's records, by link
         poses : of all UAVs at the time of each picture, by its name
         """
-        timetable = self._timetable
+        timetable, state = self._timetable, self.state
         for link, o in observers.items():
-            self.state.seen[link] = o.in_view & ~o.shadowed
-            origin, t = str(link), o.tracks
-            fed = np.where(t.kind == PathKind.TARGET, t.target, -1)
-            self.state.fed |= {Key(origin, int(k)): int(u) for k, u in zip(t.id, fed, strict=True)}
-        now = [uavs for link, uavs in self.state.seen.items() if timetable.holds(link, frame)]
-        roles = timetable.roles(frame)
-        target = np.array([role == "target" for role in roles.values()])
-        seen = np.any(now, axis=0) & target
-        return {name: self._score(view, seen, target, poses[name]) for name, view in views.items()}
+            state.seen[link], state.found[link] = o.in_view & ~o.shadowed, o.hit
+        now = [link for link in state.seen if timetable.holds(link, frame)]
+        target = np.array([role == "target" for role in timetable.roles(frame).values()])
+        seen = {link: state.seen[link] & target for link in now}
+        found = np.any([state.found[link] for link in now], axis=0) & target
+        return {name: self._score(view, seen, found, poses[name]) for name, view in views.items()}
 
     def _score(
-        self, view: View, seen: np.ndarray, target: np.ndarray, poses: Mapping[str, Pose]
+        self,
+        view: View,
+        seen_by: Mapping[Link, np.ndarray],
+        found: np.ndarray,
+        poses: Mapping[str, Pose],
     ) -> FusedRecord:
         names, bodies = list(poses), view.fused
         truth = np.array([np.concatenate([p.position, p.velocity]) for p in poses.values()])
         mean = np.array([b.state.mean for b in bodies]).reshape(-1, 6)
         covariance = np.array([b.state.covariance for b in bodies]).reshape(-1, 6, 6)
-        strange = np.array([b.terminal is None for b in bodies], bool)
-        nearest = np.linalg.norm(mean[:, None, :3] - truth[None, :, :3], axis=-1)
-        pairs = _paired(nearest[np.ix_(strange, seen)])
-        rows, columns = np.flatnonzero(strange), np.flatnonzero(seen)
-        stands = {int(columns[j]): int(rows[i]) for i, j in pairs}
-        left = np.setdiff1d(rows, list(stands.values()))
-        near = nearest[left] < GOSPA_CUTOFF_M
-        friend = (near & ~target).any(axis=1)
-        hidden = (near & target & ~seen).any(axis=1) & ~friend
-        each = GOSPA_CUTOFF_M**2 / 2
-        false = int((~friend & ~hidden).sum())
+        seen = np.any([*seen_by.values()], axis=0)
+        rows = np.flatnonzero([b.terminal is None for b in bodies])
+        distance, false = score_tracks(mean[rows, :3], truth[:, :3], seen)
+        off = self._off(mean[rows], seen_by, poses)
         follows = np.full(len(bodies), -1)
-        error = np.full((len(names), 3), np.nan)
-        for u, k in stands.items():
-            if any(self.state.fed.get(key) == u for key in bodies[k].members):
-                follows[k] = u
-                error[u] = _errors(bodies[k], truth[u])
+        error = np.full((len(names), len(ERRORS)), np.nan)
+        for k, u in assigned(off, GATE_RESOLUTIONS):
+            follows[rows[k]] = u
+            error[u] = _errors(bodies[rows[k]], truth[u])
         return FusedRecord(
-            gospa=np.array(
-                [
-                    sum(nearest[k, u] ** 2 for u, k in stands.items()),
-                    each * (int(seen.sum()) - len(stands)),
-                    each * false,
-                ]
-            ),
+            gospa=np.array(distance[1:]),
             seen=seen,
-            found=np.isin(np.arange(len(names)), follows),
+            found=found,
+            tracked=np.isin(np.arange(len(names)), follows),
             error=error,
-            false=false,
-            hidden=int(hidden.sum()),
-            unrecognised=int(friend.sum()),
+            false=int(false.sum()),
             reports=len(view.ages),
             age=float(np.mean(view.ages)) if view.ages else np.nan,
             **vars(view.traffic),
@@ -167,15 +163,24 @@ class SwarmScorer(Stateful):
             uav=follows,
         )
 
-
-def _paired(distance: np.ndarray) -> list[tuple[int, int]]:
-    """GOSPA's pairs of (n, m) distances: of the least sum of squares, each under the cutoff."""
-    if not distance.size:
-        return []
-    d2 = np.minimum(distance, GOSPA_CUTOFF_M) ** 2
-    rows, columns = linear_sum_assignment(d2)
-    near = distance[rows, columns] < GOSPA_CUTOFF_M
-    return list(zip(rows[near].tolist(), columns[near].tolist(), strict=True))
+    def _off(
+        self, states: np.ndarray, seen_by: Mapping[Link, np.ndarray], poses: Mapping[str, Pose]
+    ) -> np.ndarray:
+        """(B, U) largest distance on any axis in resolutions of the link to which the state (B, 6)
+        is nearest, of those that have the UAV in view; infinite where none has, and beyond the
+        cutoff."""
+        out = np.full((len(states), len(poses)), np.inf)
+        bodies = [Pose.at_rest(s[:3]) for s in states]
+        bodies = [replace(b, velocity=s[3:]) for b, s in zip(bodies, states, strict=True)]
+        for link, seen in seen_by.items():
+            own, at = poses[link.rx], None if link.own else poses[link.tx]
+            points = np.array([truth_of(own, b, at)[:4] for b in bodies]).reshape(-1, 4)
+            for u in np.flatnonzero(seen):
+                truth = truth_of(own, [*poses.values()][u], at)
+                out[:, u] = np.minimum(out[:, u], self._resolutions[link].off(truth, points))
+        places = np.array([pose.position for pose in poses.values()])
+        distance = np.linalg.norm(states[:, None, :3] - places, axis=-1)
+        return np.where(distance < GOSPA_CUTOFF_M, out, np.inf)
 
 
 def _errors(body: Fused, truth: np.ndarray) -> tuple[float, float, float]:
@@ -208,9 +213,9 @@ def summary_of(
 
 
 def _block(frames: Columns, bodies: Columns, names: Sequence[str]) -> dict[str, Any]:
-    """The figures of One set of fused tracks."""
-    seen, found = frames["seen"], frames["found"]
-    error, ages, reports = frames["error"][found], frames["age"], frames["reports"]
+    """Summarise one set of fused tracks."""
+    seen, found, tracked = frames["seen"], frames["found"], frames["tracked"]
+    error, ages, reports = frames["error"][tracked], frames["age"], frames["reports"]
     received = reports.sum()
     position, velocity, nees = np.mean(error ** [2, 2, 1], axis=0) if len(error) else [None] * 3
     in_view = int(seen.sum())
@@ -219,16 +224,11 @@ def _block(frames: Columns, bodies: Columns, names: Sequence[str]) -> dict[str, 
         return int(frames[name].sum())
 
     return {
-        "hit_rate": int(found.sum()) / in_view if in_view else None,
+        "in_view": in_view,
+        "hit_rate": share(int(found.sum()), in_view),
+        "tracked_rate": share(int(tracked.sum()), in_view),
         "gospa": gospa_block(frames["gospa"], seen),
-        **{
-            f"{what}_per_frame": float(np.mean(frames[name]))
-            for what, name in (
-                ("false_tracks", "false"),
-                ("hidden", "hidden"),
-                ("unrecognised", "unrecognised"),
-            )
-        },
+        "false_tracks_per_frame": float(np.mean(frames["false"])),
         "rmse": {
             "position_m": None if position is None else float(np.sqrt(position)),
             "velocity_mps": None if velocity is None else float(np.sqrt(velocity)),
@@ -246,6 +246,7 @@ def _block(frames: Columns, bodies: Columns, names: Sequence[str]) -> dict[str, 
             name: {
                 "in_view": int(seen[:, u].sum()),
                 "found": int(found[:, u].sum()),
+                "tracked": int(tracked[:, u].sum()),
                 "switches": _switches(bodies, u),
             }
             for u, name in enumerate(names)
@@ -255,7 +256,7 @@ def _block(frames: Columns, bodies: Columns, names: Sequence[str]) -> dict[str, 
 
 
 def _switches(bodies: Columns, u: int) -> int:
-    """Times that a UAV had another name than when it was found last."""
+    """Times that a UAV had another name than when it was tracked last."""
     mine = bodies["uav"] == u
     names = zip(bodies["origin"][mine].tolist(), bodies["number"][mine].tolist(), strict=True)
     return sum(a != b for a, b in pairwise(names))

@@ -228,7 +228,7 @@ class StationSet:
             Recorder(timetable, [state.name.lower() for state in TerminalState]),
             setup.swarm,
             None if cooperation == "none" else extension("cooperation")(setup),
-            SwarmScorer(timetable),
+            SwarmScorer(timetable, setup.antennas),
         )
 
     def reports(self, link: Link, frame: int) -> list[ReportedUav]:

@@ -39,19 +39,22 @@ LEGEND = {
     "Bit rate [kbit/s]": "Bit rate: decided bits over the whole run, pilots and pauses included.",
     "Late": "Late: data frames read after later ones had been received.",
     "In view": "In view: UAVs times frames in the field of view and not occluded.",
-    "Hit rate": "Hit rate: share of those in view with a detection of their own path within one "
+    "Found": "Found: share of those in view with a detection of their own path within one "
     "resolution cell on every axis.",
+    "Tracked": "Tracked: share of those in view with a confirmed track within three resolution "
+    "cells on every axis.",
+    "False tracks per frame": "False tracks: confirmed tracks that track no UAV, 5 m or more "
+    "from every one.",
     "Noise only": "Noise only: mean detection probability of this detector in noise alone.",
     "Matched filter": "Matched filter: that of a filter at the true range, velocity and direction; "
     "no receiver finds more.",
     "False alarms per frame": "False alarms: detections that no path explains.",
     "GOSPA [m]": "GOSPA (p = 2, alpha = 2, c = 5 m): distance of the confirmed tracks from the "
-    "truth; above \u201cNo tracks\u201d they are worse than none. Missed, false: UAVs and tracks "
-    "per frame.",
+    "targets; above \u201cNo tracks\u201d they are worse than none.",
     "n": "n: estimates caused by the UAV's own path within three resolution cells, the base of the "
     "RMSE.",
-    "City loss": "City loss: noise-only detection probability less hit rate. Masked, clutter, not "
-    "read: target-frames lost behind a stronger path, to clutter, and with the data.",
+    "City loss": "City loss: noise-only detection probability less the share found. Masked, "
+    "clutter, not read: target-frames lost behind a stronger path, to clutter, and with the data.",
 }
 """What a column title means."""
 
@@ -97,44 +100,56 @@ def _parts(
 ) -> Iterator[tuple[str, Mapping[str, Any], Mapping[str, Any]]]:
     """(link, its figures, those of the targets or of the terminals) where some were in view."""
     for name, s in summary["links"].items():
-        part = s.get("apart", {}).get(group)
-        if part and part["in_view"]:
+        part = s if group == "targets" else s.get("cooperative", {})
+        if part.get("in_view"):
             yield link_words(name), s, part
 
 
+_FOUND = {"In view": "in_view", "Found": "hit_rate", "Tracked": "tracked_rate"}
+_GOSPA = {"GOSPA [m]": "total_m", "No tracks [m]": "empty_m"}
+_FALSE = "False tracks per frame"
+_SCORE = (*_FOUND, _FALSE, *_GOSPA)
+
+
+def _score(part: Mapping[str, Any]) -> list[str]:
+    """Targets found and tracked, false tracks, and GOSPA."""
+    values = [*(part[key] for key in _FOUND.values()), part["false_tracks_per_frame"]]
+    return [number(v) for v in (*values, *(part["gospa"][key] for key in _GOSPA.values()))]
+
+
 def hit_table(summary: Mapping[str, Any], group: str) -> Table:
-    """Hit rate of ``targets`` or ``terminals`` by link, between its upper bounds and, of targets,
-    GOSPA with its parts."""
-    parts = {"GOSPA [m]": "total_m", "No tracks [m]": "empty_m", "Missed": "missed"}
-    parts |= {"False": "false"}
+    """Tabulate the shares of ``targets`` or ``terminals`` found and tracked by link; for targets
+    also false tracks and GOSPA, of links and of fused tracks."""
+    titles = _SCORE if group == "targets" else _SCORE[: len(_FOUND)]
+    parts = [(link, {**s, **part}) for link, s, part in _parts(summary, group)]
+    if group == "targets":
+        parts += [(f"{name}, fused", p) for name, p in _fused(summary) if p.get("in_view")]
+    rows = [(name, *_score(part)[: len(titles)]) for name, part in parts]
+    return Table((group.capitalize(), *titles), rows)
+
+
+def bound_table(summary: Mapping[str, Any], group: str) -> Table:
+    """Tabulate the share of ``targets`` or ``terminals`` found by link between its bounds."""
     rows = [
-        (
-            link,
-            number(part["in_view"]),
-            number(part["hit_rate"]),
-            *(number(part["bounds"][key]) for key in ("clutter_free", "genie")),
-            *(
-                (number(s["false_per_frame"]), *(number(part["gospa"][k]) for k in parts.values()))
-                if "gospa" in part
-                else ()
-            ),
-        )
+        (link, *map(number, (*part["bounds"].values(), part["hit_rate"], s["false_per_frame"])))
         for link, s, part in _parts(summary, group)
     ]
-    more = ("False alarms per frame", *parts) if group == "targets" else ()
-    titles = ("In view", "Hit rate", "Noise only", "Matched filter", *more)
-    return Table((group.capitalize(), *titles), rows)
+    titles = ("Matched filter", "Noise only", "Found", "False alarms per frame")
+    return Table((f"Detection of {group}", *titles), rows)
 
 
 def rmse_table(summary: Mapping[str, Any], group: str) -> Table:
     """RMSE of the detections and of the tracks of ``targets`` or ``terminals``, by link."""
     rows = [
-        (f"{link}, {estimates}s", number(part[count]), *(number(v) for v in part[key].values()))
+        (
+            f"{link}, {estimates}s",
+            number(round(part[share] * part["in_view"])),
+            *(number(v) for v in part[key].values()),
+        )
         for link, _, part in _parts(summary, group)
-        if "rmse" in part
-        for estimates, count, key in (
-            ("detection", "detected", "rmse"),
-            ("track", "tracked", "rmse_tracked"),
+        for estimates, share, key in (
+            ("detection", "matched", "rmse"),
+            ("track", "matched_tracked", "rmse_tracked"),
         )
     ]
     return Table((f"RMSE of {group}", "n", *_AXES), rows)
@@ -147,19 +162,10 @@ def side_by_side(summary: Mapping[str, Any]) -> Table:
     costs = summary["timing_s"].get("by_set", {})
     rows = []
     for name, set_name, link in _sets(summary):
-        targets = link["apart"]["targets"]
-        values = (
-            *(link[_RATES[title]] for title in titles),
-            targets["in_view"],
-            targets["hit_rate"],
-            link["false_per_frame"],
-            link["false_tracks_per_frame"],
-            targets["gospa"]["total_m"],
-            costs[set_name][name],
-        )
-        rows.append((link_words(name), set_name, *map(number, values)))
-    ends = ("In view", "Hit rate", "False alarms per frame", "False tracks per frame", "GOSPA [m]")
-    return Table(("Link", "Receivers", *titles, *ends, "Processor time [s]"), rows)
+        rates = [number(link[_RATES[title]]) for title in titles]
+        values = (*rates, *_score(link), number(costs[set_name][name]))
+        rows.append((link_words(name), set_name, *values))
+    return Table(("Link", "Receivers", *titles, *_SCORE, "Processor time [s]"), rows)
 
 
 def _sets(summary: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
@@ -167,7 +173,8 @@ def _sets(summary: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, A
     sets = {OWN: summary, **summary.get("compared", {})}
     for link in summary["links"]:
         for name, one in sets.items():
-            if name in summary["timing_s"].get("by_set", {}):
+            known = name in summary["timing_s"].get("by_set", {})
+            if known and "tracked_rate" in one["links"][link]:
                 yield link, name, one["links"][link]
 
 
@@ -181,21 +188,20 @@ def city_costs(summary: Mapping[str, Any]) -> Table:
     causes = {"Masked": "masked", "Clutter": "clutter", "Not read": "not_read"}
     rows = []
     for link, name, one in _sets(summary):
-        targets = one["apart"]["targets"]
-        noise_only, hits = targets["bounds"]["clutter_free"], targets["hit_rate"]
+        noise_only, hits = one["bounds"]["clutter_free"], one["hit_rate"]
         if hits is None or noise_only is None:
             continue
         values = (
-            targets["in_view"],
+            one["in_view"],
             hits,
             noise_only,
             round(noise_only - hits, 3),
-            *(targets["losses"][cause] for cause in causes.values()),
+            *(one["losses"][cause] for cause in causes.values()),
             sum(one["false_tracks"][kind] or 0.0 for kind in _CITY),
             one["ser_delay"],
         )
         rows.append((link_words(link), name, *map(number, values)))
-    titles = ("In view", "Hit rate", "Noise only", "City loss", *causes)
+    titles = ("In view", "Found", "Noise only", "City loss", *causes)
     ends = ("False tracks of the city", "SER delay")
     return Table(("Link", "Receivers", *titles, *ends), rows)
 
@@ -279,41 +285,29 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
     return limits, words, Table(titles, rows)
 
 
+def _fused(summary: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """(name, figures) of the fused tracks, those of the whole swarm first."""
+    if swarm := summary.get("swarm"):
+        yield "Whole swarm", swarm
+        yield from swarm["terminals"].items()
+
+
 def swarm_table(summary: Mapping[str, Any]) -> Table:
     """The fused tracks of cooperating terminals, those of the whole swarm first; no rows where none
     cooperate."""
-    swarm = summary.get("swarm")
-    if swarm is None:
-        return Table((), ())
     rows = [
         (
             name,
-            number(p["hit_rate"]),
-            *(number(p["gospa"][key]) for key in ("total_m", "empty_m", "missed", "false")),
             *(number(p["rmse"][key]) for key in ("position_m", "velocity_mps")),
             number(p["nees"]),
             *(number(p[key]) for key in ("reports_per_frame", "age_s")),
-            *_traffic(p, name in swarm["terminals"]),
+            *_traffic(p, "terminals" not in p),
         )
-        for name, p in {"Whole swarm": swarm, **swarm["terminals"]}.items()
+        for name, p in _fused(summary)
     ]
-    titles = (
-        "Fused tracks",
-        "Hit rate",
-        "GOSPA [m]",
-        "No tracks [m]",
-        "Missed",
-        "False",
-        "Position [m]",
-        "Velocity [m/s]",
-        "NEES",
-        "Reports per frame",
-        "Age [s]",
-        "Left out",
-        "kbit sent",
-        "Lost messages",
-    )
-    return Table(titles, rows)
+    errors = ("Position [m]", "Velocity [m/s]", "NEES")
+    reports = ("Reports per frame", "Age [s]", "Left out", "kbit sent", "Lost messages")
+    return Table(("Fused tracks", *errors, *reports), rows)
 
 
 def _traffic(fused: Mapping[str, Any], receives: bool) -> tuple[str, str, str]:
@@ -339,7 +333,7 @@ def false_table(summary: Mapping[str, Any]) -> Table:
         for name, s in links.items()
     ]
     titles = (cause.replace("_", " ").capitalize() for cause in causes)
-    return Table(("False tracks per frame", "All", *titles), rows)
+    return Table((_FALSE, "All", *titles), rows)
 
 
 def _uavs(summary: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:

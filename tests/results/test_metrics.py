@@ -15,9 +15,11 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Reception, no_detections
 from isac_rt.results.metrics import (
     SymbolCount,
+    assigned,
     binomial_interval,
     count_symbols,
     gospa,
+    score_tracks,
     truth_of,
     within_view,
 )
@@ -163,6 +165,38 @@ def test_gospa_parts_by_enumeration(targets, tracks):
         assert found.distance == pytest.approx(np.sqrt(square))
         beyond += found.missed > max(targets - tracks, 0) * 12.5
     assert beyond > 3
+
+
+def test_targets_are_scored_among_all_uavs():
+    """Random tracks and UAVs, half of them scored, by trying every assignment to all UAVs: pairs of
+    scored UAVs and tracks that are near nobody else make GOSPA. Planted bugs: tracks of the others
+    left in; tracks assigned to the scored alone; near UAVs of one kind alone make a track true."""
+    rng, stolen = np.random.default_rng(8), 0
+    for _ in range(40):
+        uavs, tracks = rng.normal(0, 4, (4, 3)), rng.normal(0, 5, (4, 3))
+        scored = np.array([True, True, False, False])
+        d2 = ((tracks[:, None] - uavs) ** 2).sum(axis=-1)
+        best = min(
+            permutations(range(4)), key=lambda p: sum(min(d2[k, u], 25.0) for k, u in enumerate(p))
+        )
+        pairs = {k: u for k, u in enumerate(best) if d2[k, u] < 25}
+        mine = [k for k, u in pairs.items() if scored[u]]
+        left = [k for k in range(4) if k not in pairs and (d2[k, 2:] >= 25).all()]
+        found, false = score_tracks(tracks, uavs, scored)
+        parts = sum(d2[k, pairs[k]] for k in mine), 12.5 * (2 - len(mine)), 12.5 * len(left)
+        assert found[1:] == pytest.approx(parts)
+        assert false.tolist() == (d2 >= 25).all(axis=1).tolist()
+        stolen += found[1:] != gospa(uavs[scored], tracks, 5.0)[1:]
+    assert stolen > 10
+
+
+def test_one_track_stands_for_one_uav():
+    """Two UAVs near one track, and two tracks near one UAV of two. Planted bug: each takes its
+    nearest."""
+    assert assigned(np.array([[1.0], [0.5]]), 3.0) == [(1, 0)]
+    assert assigned(np.array([[0.1, 0.2], [2.9, 0.1]]), 3.0) == [(0, 0), (1, 1)]
+    assert assigned(np.array([[0.1, 0.2], [0.3, 3.0]]), 3.0) == [(0, 1), (1, 0)]
+    assert assigned(np.zeros((0, 2)), 3.0) == []
 
 
 def test_gospa_parts_against_stone_soup():

@@ -268,12 +268,13 @@ def test_shadowed_or_behind_is_not_in_view():
     assert record.loss.tolist() == [-1, -1, -1, Loss.OTHER]
 
 
-def test_tracks_are_judged_by_what_feeds_them():
-    """Over four frames: a tentative track of U1, one of a wall at U1's place that started before
-    it, one of U1. While it coasts a track keeps the label of its latest detection; when the wall
-    feeds the track it follows nobody. Planted bugs: the nearest track follows; the label of the
-    frame's first detection; the label of a coasting track forgotten."""
-    test_cells = scorer("AT")
+def test_a_uav_is_tracked_by_place_and_errors_are_of_its_own_path():
+    """Over four frames: a tentative track at U1's place, one that a wall feeds, one of U1's echo
+    0.9 m off. The wall's started first and follows U1, but its errors count only from the frame on
+    in which the echo feeds it, also while it coasts. Planted bugs: tentative tracks follow; the
+    label of the frame's first detection; the label of a coasting track forgotten; errors of every
+    track that follows."""
+    judge = scorer("AT")
 
     def step(frame, fed, labels):
         """`fed`: row of each track's detection; `labels`: kinds of the paths behind the rows."""
@@ -283,51 +284,59 @@ def test_tracks_are_judged_by_what_feeds_them():
         points = [point("AT", "U1", frame, places[label]) for label in labels]
         tracks = [(11, False, fed[1], "U1", 0.0)] * (frame == DATA)
         tracks += [(4, True, fed[0], "U1", 0.1), (9, True, fed[1], "U1", 0.9)]
-        return scored(test_cells, frame, rows, points, tracks).tracks
+        record = scored(judge, frame, rows, points, tracks)
+        assert not record.tracks.false.any()
+        return record.tracks, bool(np.isfinite(record.tracked.range[0]))
 
-    first = step(DATA, (1, 0), ["echo", "wall"])
-    assert first.uav.tolist() == [-1, -1, 0]
+    first, known = step(DATA, (1, 0), ["echo", "wall"])
+    assert (first.uav.tolist(), known) == ([-1, 0, -1], False)
     assert first.kind.tolist() == [PathKind.TARGET, PathKind.DIFFUSE, PathKind.TARGET]
     assert first.target.tolist() == [0, -1, 0]
-    assert step(DATA + 1, (-1, -1), []).uav.tolist() == [-1, 0]
-    assert list(test_cells.state.labels) == [4, 9]
+    second, known = step(DATA + 1, (-1, -1), [])
+    assert second.kind.tolist() == [PathKind.DIFFUSE, PathKind.TARGET] and not known
+    assert list(judge.state.labels) == [4, 9]
     again = scorer("AT")
-    again.restore(test_cells.memory())
-    test_cells = again
-    assert step(DATA + 2, (0, -1), ["echo"]).uav.tolist() == [-1, 0]
-    assert step(DATA + 3, (0, 1), ["echo", "wall"]).uav.tolist() == [0, -1]
+    again.restore(judge.memory())
+    judge = again
+    for frame, fed, labels in ((DATA + 2, (0, -1), ["echo"]), (DATA + 3, (-1, -1), [])):
+        tracks, known = step(frame, fed, labels)
+        assert (tracks.uav.tolist(), known) == ([0, -1], True)
 
 
-def test_gospa_is_of_confirmed_tracks_and_uavs_in_view():
-    """U1 with a track 0.3 m off, U2 in view without one, PT1 shadowed with one, a tentative track:
-    localisation 0.09, one missed, one false. Planted bugs: tentative tracks count; shadowed UAVs
-    count; positions in world coordinates."""
+def test_gospa_is_of_confirmed_tracks_and_targets_in_view():
+    """U1 with a track 0.3 m off, U2 in view without one, PT1 occluded with one, a tentative track,
+    one 40 m from U1: localisation 0.09, one missed, one false. Planted bugs: tentative tracks
+    count; the terminal's track is false; positions in world coordinates."""
     rows = [path_of("AT", "U1", DATA, 3.0), path_of("AT", "U2", DATA, 3.0)]
     tracks = [(1, True, -1, "U1", 0.3), (2, True, -1, "PT1", 0.0), (3, False, -1, "U2", 0.0)]
+    tracks += [(4, True, -1, "U1", 40.0)]
     record = scored(scorer("AT"), DATA, rows, [], tracks)
     assert record.gospa[1:] == pytest.approx((0.09, 12.5, 12.5))
+    assert record.tracks.false.tolist() == [False, False, False, True]
     table = record.tracks  # of tracks that no detection has fed yet nothing is said
-    assert {*table.kind, *table.target, *table.uav} == {-1}
+    assert {*table.kind, *table.target} == {-1}
 
 
 def test_targets_are_scored_without_the_terminals():
-    """U1 with a track 0.3 m off, PT1 with one of its own path 2 m off that coasts in the next
-    frame, and a wall's track at U2, who is not in view: of all there is one false track, of targets
-    alone likewise, and PT1's is neither found nor false. The bounds are those of 20 dB and more.
-    Planted bugs: the terminal's track counts as false; its label forgotten as it coasts."""
-    test_cells = scorer("AT")
-    for frame, fed in ((DATA, (0, 1, 2)), (DATA + 1, (-1, -1, -1))):
-        rows = [path_of("AT", "U1", frame, 3.0), path_of("AT", "PT1", frame, 3.0)]
-        rows += [path_of("AT", "U2", frame, 3.0, PathKind.DIFFUSE)]
-        points = [point("AT", name, frame) for name in ("U1", "PT1", "U2")] if fed[0] == 0 else []
-        names = zip((4, 5, 6), fed, ("U1", "PT1", "U2"), (0.3, 2.0, 0.0), strict=True)
-        tracks = [(number, True, row, name, east) for number, row, name, east in names]
-        record = scored(test_cells, frame, rows, points, tracks)
-        assert record.cooperative.tolist() == [False, True, True, False]
-        assert record.gospa[1:] == pytest.approx((4.09, 0.0, 12.5))
-        assert record.gospa_targets[1:] == pytest.approx((0.09, 0.0, 12.5))
-        assert (record.genie[[0, 2]] > 0.99).all() and np.isnan(record.genie[[1, 3]]).all()
-        assert (record.clutter_free[[0, 2]] > 0.99).all()
+    """U1 with a track 0.3 m off, PT1 with one 2 m off, and a wall's track at U2, who is not in
+    view: neither PT1's nor U2's is found or false. The bounds are those of 20 dB and more. Where
+    all are terminals, they are the targets: PT1's track counts. Planted bugs: the terminal's track
+    counts as false; a swarm of terminals without targets."""
+    rows = [path_of("AT", "U1", DATA, 3.0), path_of("AT", "PT1", DATA, 3.0)]
+    rows += [path_of("AT", "U2", DATA, 3.0, PathKind.DIFFUSE)]
+    names = zip((4, 5, 6), ("U1", "PT1", "U2"), (0.3, 2.0, 0.0), strict=True)
+    tracks = [(number, True, -1, name, east) for number, name, east in names]
+    record = scored(scorer("AT"), DATA, rows, [], tracks)
+    assert record.cooperative.tolist() == [False, True, True, False]
+    assert record.gospa[1:] == pytest.approx((0.09, 0.0, 0.0))
+    assert (record.genie[[0, 2]] > 0.99).all() and np.isnan(record.genie[[1, 3]]).all()
+    assert (record.clutter_free[[0, 2]] > 0.99).all()
+    roles = TIMETABLE.first_roles
+    alone = replace(TIMETABLE, first_roles=roles | {"U1": "passive", "U2": "passive"})
+    judge = Scorer(Link("AT", "AT"), ANTENNAS, SWARM, alone, Receivers())
+    record = scored(judge, DATA, rows, [], tracks)
+    assert not record.cooperative.any()
+    assert record.gospa[1:] == pytest.approx((4.09, 0.0, 0.0))
 
 
 def test_an_alias_or_a_drifted_track_does_not_stand_for_a_uav():

@@ -10,26 +10,22 @@ from isac_rt.results.columns import MEASURES
 from isac_rt.results.losses import LOSSES, Loss
 from isac_rt.results.sensing import FALSE_CAUSES, Sensing, summary_block
 
-GOSPA = {
-    f"{of}_{part}": 0.0
-    for of in ("gospa", "gospa_targets")
-    for part in ("localisation", "missed", "false")
-}
+GOSPA = {f"gospa_{part}": 0.0 for part in ("localisation", "missed", "false")}
 
 
 def row(seen=(1, 1), errors=(None, None), tracks=(), **more):
-    """One frame of two UAVs: errors of detections (range, velocity, azimuth, elevation) [SI, rad],
-    tracks of (id, confirmed, kind, target, followed UAV)."""
+    """One frame of two UAVs, targets: errors of detections (range, velocity, azimuth, elevation)
+    [SI, rad], tracks of (id, false, kind, target, followed UAV)."""
     seen = np.array(seen, bool)
     out = {"in_view": seen, "shadowed": np.zeros(2, bool), "hit": np.zeros(2, bool)}
     out |= {"loss": np.where(seen, Loss.OTHER, -1), "num_false": 0, "num_clutter": 0, **GOSPA}
-    out |= {"cooperative": np.array([False, True])}
+    out |= {"cooperative": np.array([False, False])}
     out |= {
         "genie": np.where(seen, [0.9, 0.4], np.nan),
         "clutter_free": np.where(seen, 0.7, np.nan),
     }
     table = np.array(tracks, int).reshape(-1, 5)
-    out["track"] = dict(zip(("id", "confirmed", "kind", "target", "uav"), table.T, strict=True))
+    out["track"] = dict(zip(("id", "false", "kind", "target", "uav"), table.T, strict=True))
     for k, name in enumerate(MEASURES):
         truth = np.array([17.3, -2.9])
         out[f"truth_{name}"] = truth
@@ -137,23 +133,22 @@ def test_gospa_is_the_root_of_its_parts():
 
 
 def test_false_tracks_by_cause():
-    """Confirmed ones that follow nobody: a wall, noise, two ghosts of UAV 1, a second track of UAV
-    0. Planted bugs: tentative tracks count; the one that follows counts."""
+    """A wall's, one of noise and two ghosts of UAV 1 are far from every UAV; a second track of UAV
+    0 is near it. Planted bug: all that follow nobody count."""
     ghost, target = int(PathKind.GHOST), int(PathKind.TARGET)
     tracks = [
-        (1, 1, target, 0, 0),
+        (1, 0, target, 0, 0),
         (2, 1, int(PathKind.DIFFUSE), -1, -1),
-        (3, 0, int(PathKind.SPECULAR), -1, -1),
         (4, 1, -1, -1, -1),
         (5, 1, ghost, 1, -1),
         (6, 1, ghost, 1, -1),
-        (7, 1, target, 0, -1),
+        (7, 0, target, 0, -1),
     ]
     s = sensing([row(tracks=tracks), row()])
     block = s.block()
-    expected = {"diffuse": 0.5, "noise": 0.5, "ghost": 1.0, "target": 0.5}
+    expected = {"diffuse": 0.5, "noise": 0.5, "ghost": 1.0}
     assert block["false_tracks"] == dict.fromkeys(FALSE_CAUSES, 0.0) | expected
-    assert block["false_tracks_per_frame"] == pytest.approx(2.5)
+    assert block["false_tracks_per_frame"] == pytest.approx(2.0)
     assert [t["ghost_tracks"] for t in s.targets(["U1", "U2"]).values()] == [0, 2]
 
 
@@ -163,7 +158,7 @@ def test_switches_and_interruptions():
     is a switch."""
     follow = [5, None, 5, 0, 0, 5, 8, 5]
     rows = [
-        row(seen=(k is not None, 1), tracks=[(k, 1, 1, 0, 0)] if k else [(5, 1, 1, 0, -1)])
+        row(seen=(k is not None, 1), tracks=[(k, 0, 1, 0, 0)] if k else [(5, 0, 1, 0, -1)])
         for k in follow
     ]
     one, two = sensing(rows).targets(["U1", "U2"]).values()
@@ -173,11 +168,11 @@ def test_switches_and_interruptions():
 
 def test_links_pool_frame_by_frame():
     """Rates over the frames of both; a switch is counted within its link only."""
-    one = sensing([row(tracks=[(5, 1, 1, 0, 0)], num_clutter=4)])
-    two = sensing([row(tracks=[(6, 1, 1, 0, 0)])] * 3)
+    one = sensing([row(tracks=[(5, 0, 1, 0, 0)], num_clutter=4)])
+    two = sensing([row(tracks=[(6, 0, 1, 0, 0)])] * 3)
     both = Sensing.pooled([one, two])
     assert both.block()["clutter_per_frame"] == pytest.approx(1.0)
-    assert both.block()["matched_tracked"] == pytest.approx(4 / 8)
+    assert both.block()["tracked_rate"] == pytest.approx(4 / 8)
     assert both.targets(["U1", "U2"])["U1"]["switches"] == 0
 
 
@@ -190,34 +185,37 @@ def test_nothing_is_null():
     assert block["losses"] == dict.fromkeys(LOSSES, 0)
 
 
-def test_terminals_and_targets_apart():
-    """Of three frames UAV 0, a target, is in view in two and found in one, UAV 1, a terminal, in
-    view in three and found in all; GOSPA without the terminal has parts of its own. Planted bugs:
-    all UAVs in either part; the GOSPA of all; the empty picture of all."""
+def test_targets_alone_are_scored_and_terminals_stand_beside():
+    """Of three frames UAV 0, a target, is in view in two, found in one and tracked in two; UAV 1, a
+    terminal, is in view in three and found in all. Planted bugs: all UAVs in either part; the empty
+    picture of all."""
     hits = [(True, True), (False, True), (False, True)]
     rows = [
         row(
             seen=(k > 0, 1),
             hit=np.array(hit) & (k > 0, True),
-            gospa_targets_missed=12.5 * (k == 1),
-            gospa_missed=1000.0,
+            tracks=[(5, 0, 1, 0, 0)] * (k > 0),
+            gospa_missed=12.5 * (k == 1),
+            cooperative=np.array([False, True]),
         )
         for k, hit in zip((1, 2, 0), hits, strict=True)
     ]
-    apart = sensing(rows).block()["apart"]
-    targets, terminals = apart["targets"], apart["terminals"]
-    assert (targets["in_view"], targets["hit_rate"]) == (2, 0.5)
+    block = summary_block("active", sensing(rows), None, 1.0)
+    terminals = block["cooperative"]
+    assert (block["in_view"], block["hit_rate"], block["tracked_rate"]) == (2, 0.5, 1.0)
+    assert block["counts"]["hit_rate"] == [1, 2] and block["counts"]["tracked_rate"] == [2, 2]
     assert (terminals["in_view"], terminals["hit_rate"]) == (3, 1.0)
-    assert targets["bounds"] == pytest.approx({"genie": 0.9, "clutter_free": 0.7})
+    assert terminals["tracked_rate"] == 0.0
+    assert block["bounds"] == pytest.approx({"genie": 0.9, "clutter_free": 0.7})
     assert terminals["bounds"] == pytest.approx({"genie": 0.4, "clutter_free": 0.7})
-    assert targets["gospa"]["total_m"] == pytest.approx(np.sqrt(12.5 / 3))
-    assert targets["gospa"]["empty_m"] == pytest.approx(np.sqrt(12.5 * 2 / 3))
+    assert block["gospa"]["total_m"] == pytest.approx(np.sqrt(12.5 / 3))
+    assert block["gospa"]["empty_m"] == pytest.approx(np.sqrt(12.5 * 2 / 3))
     # errors of 1 and 3 cm of the target, of 5 cm of the terminal where both are in view
-    off = [row(errors=((0.01, 0, 0, 0), (0.05, 0, 0, 0))), row(errors=((0.03, 0, 0, 0), None))]
-    apart = sensing(off).block()["apart"]
-    assert [apart[group]["detected"] for group in ("targets", "terminals")] == [2, 1]
-    assert apart["targets"]["rmse"]["range_m"] == pytest.approx(np.sqrt(5e-4))
-    assert apart["terminals"]["rmse"]["range_m"] == pytest.approx(0.05)
-    assert apart["terminals"]["tracked"] == 0 and sum(apart["targets"]["losses"].values()) == 2
-    bounds = sensing(rows).block()["bounds"]
-    assert bounds["genie"] == pytest.approx((2 * 0.9 + 3 * 0.4) / 5)
+    told = {"cooperative": np.array([False, True])}
+    off = [row(errors=((0.01, 0, 0, 0), (0.05, 0, 0, 0)), **told)]
+    off += [row(errors=((0.03, 0, 0, 0), None), **told)]
+    block = sensing(off).block()
+    assert (block["matched"], block["cooperative"]["matched"]) == (1.0, 0.5)
+    assert block["rmse"]["range_m"] == pytest.approx(np.sqrt(5e-4))
+    assert block["cooperative"]["rmse"]["range_m"] == pytest.approx(0.05)
+    assert sum(block["losses"].values()) == 2

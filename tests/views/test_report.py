@@ -15,6 +15,7 @@ from fake_run import fake_run
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.views.report import wall_table, write_report
 from isac_rt.views.tables import (
+    bound_table,
     data_table,
     error_table,
     false_table,
@@ -58,29 +59,35 @@ def test_a_sensor_has_no_data_and_no_legend_of_data(summary):
     """Planted bug: the active terminal's own link as one that carries data."""
     table = data_table(summary)
     assert [r[0] for r in table.rows] == ["AT to PT1"]
-    assert "SER" in legend(table) and "Hit rate" not in legend(table)
+    assert "SER" in legend(table) and "Found" not in legend(table)
     name, own = next((n, s) for n, s in summary["links"].items() if s["ser_delay"] is None)
     alone = {"links": {name: own}}
     assert not data_table(alone).rows
     said = legend(data_table(alone), hit_table(alone, "targets"))
-    assert "SER" not in said and "Hit rate" in said
+    assert "SER" not in said and "Found" in said
 
 
 def test_targets_and_terminals_are_scored_apart_with_their_numbers(summary):
     """PT1 found U1 in five frames of its six in view, 6.37 cm off in range; the transmitter, which
     reports its position, has rows of its own. Planted bugs: all UAVs in both; the tracks' number
     for the detections."""
-    block = summary["links"]["AT->PT1"]["apart"]
     for group, n in (("targets", "6"), ("terminals", "7")):
-        found = row(hit_table(summary, group), "AT to PT1")
-        assert found["In view"] == n == str(block[group]["in_view"])
+        assert row(hit_table(summary, group), "AT to PT1")["In view"] == n
         errors = row(rmse_table(summary, group), "AT to PT1, detections")
-        assert errors["n"] == str(block[group]["detected"])
-        assert errors["Range [m]"] == "0.0637"
-    assert row(hit_table(summary, "targets"), "AT to PT1")["Hit rate"] == "0.833"
+        assert (errors["n"], errors["Range [m]"]) == (n, "0.0637")
+        assert row(bound_table(summary, group), "AT to PT1")["Noise only"] == "0.83"
+    targets = row(hit_table(summary, "targets"), "AT to PT1")
+    assert (targets["Found"], targets["Tracked"]) == ("0.833", "1")
     assert "GOSPA [m]" not in hit_table(summary, "terminals").columns
-    tracks = row(rmse_table(summary, "targets"), "AT to PT1, tracks")
-    assert tracks["n"] == str(block["targets"]["tracked"])
+
+
+def test_fused_tracks_stand_under_those_of_the_links(summary):
+    """Planted bug: a picture without a target in view."""
+    own = summary["links"]["AT->AT"] | {"in_view": 9, "hit_rate": 0.25, "tracked_rate": 0.75}
+    swarm = own | {"terminals": {"PT1": own | {"in_view": 0}}}
+    rows = [r[:4] for r in hit_table(summary | {"swarm": swarm}, "targets").rows]
+    assert [r[0] for r in rows] == ["AT to AT", "AT to PT1", "Whole swarm, fused"]
+    assert rows[-1][1:] == ("9", "0.25", "0.75")
 
 
 def test_walls_behind_what_was_seen():
@@ -123,9 +130,9 @@ def test_why_not(summary):
 
 
 def test_picture(summary):
-    """In frame 4 the track of U1 follows nobody in view."""
+    """In frame 4 the track of U1 is false."""
     hits, false = hit_table(summary, "targets"), false_table(summary)
-    assert row(hits, "AT to PT1")["False"] == "0.143"
+    assert row(hits, "AT to PT1")["False tracks per frame"] == "0.143"
     assert row(false, "AT to PT1") == {
         "False tracks per frame": "AT to PT1",
         "All": "0.143",
@@ -136,12 +143,13 @@ def test_picture(summary):
 def test_summaries_of_earlier_versions_have_none(summary):
     old = copy.deepcopy(summary)
     for block in old["links"].values():
-        for key in ("apart", "false_tracks", "targets"):
+        for key in ("in_view", "tracked_rate", "cooperative", "false_tracks", "targets"):
             del block[key]
     for table in (false_table, target_table, error_table, loss_table):
         assert not table(old).rows
     for group in ("targets", "terminals"):
-        assert not hit_table(old, group).rows and not rmse_table(old, group).rows
+        for table in (hit_table, bound_table, rmse_table):
+            assert not table(old, group).rows
 
 
 def test_tables_fit_the_page(summary):
@@ -155,8 +163,9 @@ def test_tables_fit_the_page(summary):
             target["losses"] = dict.fromkeys(target["losses"], 1234)
             for key in ("median", "p90", "bound_median", "bound_p90"):
                 target[key] = dict.fromkeys(target[key], 0.00012345)
-    for table in (hit_table, rmse_table, false_table, target_table, error_table, loss_table):
-        found = table(full, "targets") if table in (hit_table, rmse_table) else table(full)
+    of_groups = (hit_table, bound_table, rmse_table)
+    for table in (*of_groups, false_table, target_table, error_table, loss_table):
+        found = table(full, "targets") if table in of_groups else table(full)
         cells = zip(found.columns, *found.rows, strict=True)
         width = sum(max(map(len, column)) * 7.5 + 22 for column in cells)
         assert width < 1200, table.__name__
