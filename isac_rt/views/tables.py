@@ -121,7 +121,9 @@ def hit_table(summary: Mapping[str, Any], group: str) -> Table:
     """Tabulate the shares of ``targets`` or ``terminals`` found and tracked by link; for targets
     also false tracks and GOSPA, of links and of fused tracks."""
     titles = _SCORE if group == "targets" else _SCORE[: len(_FOUND)]
-    parts = [(link, {**s, **part}) for link, s, part in _parts(summary, group)]
+    parts: list[tuple[str, Mapping[str, Any]]] = [
+        (link, {**s, **part}) for link, s, part in _parts(summary, group)
+    ]
     if group == "targets":
         parts += [(f"{name}, fused", p) for name, p in _fused(summary) if p.get("in_view")]
     rows = [(name, *_score(part)[: len(titles)]) for name, part in parts]

@@ -121,7 +121,7 @@ def test_objects_print_themselves_in_short(results):
     setup = prepare(results.scenario)
     paths = setup.frame(2).paths["A", "P"]
     assert repr(paths).startswith("<PathSet A -> P at 0.0030 s: 1 line of sight")
-    assert "hit rate" in repr(results)
+    assert "targets found" in repr(results)
     assert repr(setup.city) == "<CityMesh free space: 0 faces, 0 x 0 x 0 m, 0 materials>"
     w = Waveform(num_samples=16, num_chirps=6)
     cube = IFCube(
