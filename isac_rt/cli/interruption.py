@@ -29,7 +29,10 @@ def ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
     call, leaving no half-written file. Whatever ends it, say which frames `folder` keeps.
 
     Python runs its own handler only between byte codes; the wake-up pipe is written by the C
-    handler at once, and a thread waits for it.
+    handler at once, and a thread waits for it. Only the main thread may give a signal its default
+    action back, and that one is busy; blocking the signals until a thread waits for them would
+    hand the block down to all child processes. So the thread ends the process by `os._exit`, with
+    the status that a shell reports after the signal.
     """
     from isac_rt.simulation.resume import FILE, ResumeError
     from isac_rt.storage import abandon
