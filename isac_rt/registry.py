@@ -135,6 +135,7 @@ COMMANDS = Registry("commands", {})
 """Functions with typer's annotations, whose docstring is the help."""
 EXTENSIONS = {
     "equipment": "isac_rt.extensions.city_receivers.standard:equipment_of",
+    "two_bounces": "isac_rt.extensions.two_bounces.two_bounces:TwoBounces",
     "walls": "isac_rt.extensions.city_receivers.walls:Walls",
     "expected_clutter": "isac_rt.extensions.city_receivers.expectation:make_expectation",
     "cooperation": "isac_rt.extensions.cooperation.swarm:Cooperation",

@@ -156,7 +156,7 @@ OF_CASES = {
         "kernels/propagation_field.py", "power *= abs(back) / np.pi", "power *= 1 / np.pi"
     ),
     "lambertian wall by way of the ground": Bug(
-        "propagation/clutter/two_bounces.py",
+        "extensions/two_bounces/two_bounces.py",
         """start = mirror.image(state.start)
         else:
             end = mirror.image(state.end)""",

@@ -30,7 +30,7 @@ import copy
 import logging
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
@@ -39,7 +39,6 @@ from isac_rt.frame.link import Link
 from isac_rt.propagation.clutter.cells import Density
 from isac_rt.propagation.clutter.field import ClutterField
 from isac_rt.propagation.clutter.merging import NoiseFloor
-from isac_rt.propagation.clutter.two_bounces import TwoBounces
 from isac_rt.propagation.clutter.visibility import Flight
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.legs.chains import Search
@@ -60,6 +59,7 @@ from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
 from isac_rt.propagation.settings import Clutter, Propagation
+from isac_rt.registry import extension
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.city.scene import shared_scenes
 from isac_rt.world.swarm import Pose, Swarm
@@ -101,15 +101,16 @@ class RayTracer:
         self._edges = ShadowEdges(city, shadows, wavelength)
         self.field: ClutterField | None = None
         """The scatterers on the city's surfaces."""
-        self.two_bounces: TwoBounces | None = None
-        """The same scatterers by way of mirrors."""
+        self.two_bounces: Any = None
+        """The same scatterers by way of mirrors
+        (`isac_rt.extensions.two_bounces.two_bounces.TwoBounces`)."""
         if clutter.model == "field":
             _LOG.info("placing the scatterers of the clutter")
             self.field = ClutterField.plan(
                 Density.of(clutter), swarm, city, scene, wavelength, free.seed, floor
             )
             if clutter.mirrors:
-                self.two_bounces = TwoBounces.plan(
+                self.two_bounces = extension("two_bounces").plan(
                     self.field, city, wavelength, free.seed, clutter.mirrors
                 )
         depth = propagation.max_bounces if city.num_faces else 0

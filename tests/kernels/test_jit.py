@@ -144,7 +144,7 @@ kept.rebuild = lambda self, target, box: rebuild(self, target, *box)
         ("kernels.signal_noise", "kernels/signal_noise.py"),
         ("kernels.signal_gridded", "kernels/vector.py"),
         ("receive.transform", "kernels/fourier.py"),
-        ("propagation.clutter.two_bounces", "propagation/clutter/field.py"),
+        ("extensions.two_bounces.two_bounces", "propagation/clutter/field.py"),
     ],
 )
 def test_every_kernel_that_is_called_counts(copy, module, file):

@@ -42,6 +42,23 @@ PLACES = np.array([[0.7, -5.1, 8.3], [1.9, 6.2, 8.9]])
 DENSITY = Density(0.05, 0.07)
 
 
+def joined(*parts: CityMesh) -> CityMesh:
+    """Several meshes in one, each with its own material."""
+    shift = np.cumsum([0] + [len(p.vertices) for p in parts])
+    faces = np.concatenate([p.faces + s for p, s in zip(parts, shift, strict=False)]).astype(
+        np.int32
+    )
+    material = np.repeat(np.arange(len(parts)), [p.num_faces for p in parts]).astype(np.int16)
+    return CityMesh(
+        "several",
+        np.concatenate([p.vertices for p in parts]),
+        faces,
+        material,
+        tuple(p.materials[0] for p in parts),
+        np.zeros(3),
+    )
+
+
 def canyon(centre=(0.31, -0.17, 0.9)) -> CityMesh:
     return load_city(CANYON, ".", F_C, centre)
 

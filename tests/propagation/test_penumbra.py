@@ -11,8 +11,7 @@ from scipy import special
 from test_clutter_against_sionna import flown as street_of
 from test_clutter_coherence import ROUND_A_CORNER, crossing
 from test_clutter_coherence import flown as flown_round
-from test_clutter_field import LAMBDA, METAL, flown, rectangle, slab
-from test_two_bounces import joined
+from test_clutter_field import LAMBDA, METAL, flown, joined, rectangle, slab
 
 from isac_rt.propagation.legs.diffraction import edge_factor
 from isac_rt.propagation.legs.edges import ShadowEdges

@@ -14,13 +14,13 @@ from typing import NamedTuple
 import mitsuba as mi
 import numpy as np
 
+from isac_rt.extensions.two_bounces.two_bounces import SeenByMirror, TwoBounces
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.cells import Density
 from isac_rt.propagation.clutter.field import ClutterField, Seen
 from isac_rt.propagation.clutter.merging import NoiseFloor
-from isac_rt.propagation.clutter.two_bounces import SeenByMirror, TwoBounces
 from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import generator, seed_sequence

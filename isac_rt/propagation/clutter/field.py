@@ -16,8 +16,8 @@ and TM parts meet the facet, f_s the pattern: Lambert's cos(theta_o)/pi, or lobe
 kept: what comes in vertical goes out vertical, as with Sionna's default. Gamma belongs to the way
 in, so the two directions of a link differ a little.
 
-One bounce; `two_bounces` adds a mirror before or after it. Delay, rate, acceleration and directions
-are float64 closed forms of the point and the poses.
+One bounce; `isac_rt.extensions.two_bounces` adds a mirror before or after it. Delay, rate,
+acceleration and directions are float64 closed forms of the point and the poses.
 
 Import only after `isac_rt.runtime.activate()`.
 

@@ -27,6 +27,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from isac_rt.extensions.two_bounces.mirrors import Mirror, shown, strongest
 from isac_rt.frame.antennas import Antennas
 from isac_rt.propagation.clutter.field import (
     ClutterField,
@@ -34,7 +35,6 @@ from isac_rt.propagation.clutter.field import (
     motion_to,
     scattered_power,
 )
-from isac_rt.propagation.clutter.mirrors import Mirror, shown, strongest
 from isac_rt.propagation.legs.discs import UavDiscs
 from isac_rt.propagation.legs.reflection import mirrored_field, slab_coefficients, vertical
 from isac_rt.propagation.pathset import PathKind, PathSet

@@ -21,6 +21,7 @@ from test_clutter_field import (
     C,
     flown,
     hemisphere,
+    joined,
     lobe,
     rectangle,
     slab,
@@ -40,23 +41,6 @@ from isac_rt.world.city import CityMesh, Material, load_city
 from isac_rt.world.swarm import Pose
 
 pytestmark = pytest.mark.sionna
-
-
-def joined(*parts: CityMesh) -> CityMesh:
-    """Several meshes in one, each with its own material."""
-    shift = np.cumsum([0] + [len(p.vertices) for p in parts])
-    faces = np.concatenate([p.faces + s for p, s in zip(parts, shift, strict=False)]).astype(
-        np.int32
-    )
-    material = np.repeat(np.arange(len(parts)), [p.num_faces for p in parts]).astype(np.int16)
-    return CityMesh(
-        "several",
-        np.concatenate([p.vertices for p in parts]),
-        faces,
-        material,
-        tuple(p.materials[0] for p in parts),
-        np.zeros(3),
-    )
 
 
 def coefficients(material: Material, cos: float) -> tuple[complex, complex]:

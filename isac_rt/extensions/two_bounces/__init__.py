@@ -1,0 +1,1 @@
+"""Clutter over mirrors: a wall before or after the scatterer."""
