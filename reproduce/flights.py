@@ -65,15 +65,12 @@ def _ratio(part: float | None, whole: float | None) -> float:
 
 def _of_found(block: Block) -> float:
     """Return the share of the targets found that are tracked; at most 1, for tracks bridge gaps."""
-    targets = block["apart"]["targets"]
-    found = round((targets["hit_rate"] or 0) * targets["in_view"])
-    return min(_ratio(targets["tracked"], found), 1.0)
+    return min(_ratio(block["counts"]["tracked_rate"][0], block["counts"]["hit_rate"][0]), 1.0)
 
 
 def _of_bound(block: Block) -> float:
     """Return the share of the targets that are detectable and tracked, at most 1."""
-    targets = block["apart"]["targets"]
-    return min(_ratio(targets["tracked"], (targets["bounds"][BOUND] or 0) * targets["in_view"]), 1)
+    return min(_ratio(block["tracked_rate"], block["bounds"][BOUND]), 1.0)
 
 
 def _of_empty(block: Block) -> float:
@@ -168,21 +165,17 @@ class Goal:
         return Verdict(self.claim, judged(sure, met), said)
 
 
-def _gospa(role: str) -> Callable[[Block], Values]:
-    return _at(role, lambda block: _of_empty(block["apart"]["targets"]))
-
-
 _AT, _PT, _OF_EMPTY = "active", "passive", "GOSPA of targets over that of no tracks"
 GOALS = {
     "at_tracked": Goal("AT: targets tracked over found", _at(_AT, _of_found), 0.9, least=True),
     "at_false": Goal(
         "AT: false tracks a frame", _at(_AT, lambda b: float(b["false_tracks_per_frame"])), 0.2
     ),
-    "at_gospa": Goal(f"AT: {_OF_EMPTY}", _gospa(_AT), 1.0, 0.45),
+    "at_gospa": Goal(f"AT: {_OF_EMPTY}", _at(_AT, _of_empty), 1.0, 0.45),
     "pt_tracked": Goal(
         f"PT: targets tracked over {BOUND}", _at(_PT, _of_bound), 0.5, 0.75, True, np.median
     ),
-    "pt_gospa": Goal(f"PT: {_OF_EMPTY}", _gospa(_PT), 1.0),
+    "pt_gospa": Goal(f"PT: {_OF_EMPTY}", _at(_PT, _of_empty), 1.0),
     "fused_gospa": Goal(f"fused: {_OF_EMPTY}", _fused(_of_empty), 0.6, 0.3),
     "misread": Goal("data frames of SER over 0.5 that count as read", _misread, 0, 0, pool=np.sum),
     "switches": Goal("switched names of UAVs in the fused tracks", _fused(_switches), limit=0.5),

@@ -22,9 +22,9 @@ from reproduce.flights import GOALS, Goal
 
 def block(role, found, tracked, bound=1.0, gospa=(1.0, 4.0)):
     of_gospa = dict(zip(("total_m", "empty_m"), gospa, strict=True))
-    targets = {"in_view": 40, "hit_rate": found, "tracked": tracked, "gospa": of_gospa}
-    targets["bounds"] = {flights.BOUND: bound}
-    return {"role": role, "false_tracks_per_frame": 0.1, "apart": {"targets": targets}}
+    counts = {"hit_rate": [round(40 * found), 40], "tracked_rate": [tracked, 40]}
+    about = {"role": role, "counts": counts, "bounds": {flights.BOUND: bound}, "gospa": of_gospa}
+    return {**about, "tracked_rate": tracked / 40, "false_tracks_per_frame": 0.1}
 
 
 def test_goals_by_hand():
