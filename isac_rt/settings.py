@@ -111,9 +111,9 @@ class AspectTable(Node):
     """Values over a grid of directions in the body's frame."""
 
     azimuth_deg: Rising
-    """Azimuths of the columns, rising, from the boresight to the right [degrees]. Beyond the first
-    and last the nearest counts; a table that leaves out no more than a step of the circle, such as
-    one from 0 to 350, goes round."""
+    """Azimuths of the columns, rising, from the boresight to the right [degrees]. Beyond the ends
+    the nearest column counts; a table whose gap is at most one step of the circle, such as 0 to
+    350, is periodic."""
     elevation_deg: Rising
     """Elevations of the rows, rising, from the horizontal upwards [degrees]."""
     values_db: tuple[tuple[Decibels, ...], ...]

@@ -20,9 +20,9 @@ class Access(Node):
     """Who sets the clocks right: `external`, the default, an outside source that keeps all equal;
     `two_round`, passive terminals by what the stages before the data measured; `none`, nobody."""
     feedback_rate_bps: Annotated[float, Field(ge=1e3, le=1e9)] = 50e3
-    """Rate at which a passive terminal tells an active one of its tracks or detections, for
-    `cooperation`; bits that protect it are not counted [bit/s]. The default is about what the
-    paper's data frames carry so protected, at one frame in 45 ms."""
+    """Rate of a passive terminal's feedback of tracks or detections to an active one, for
+    `cooperation`, without its error protection [bit/s]. The default is about the protected payload
+    of the paper's frames, one frame in 45 ms."""
     feedback: bool = False
     """Whether passive terminals report their range and symbols after every frame that active ones
     process, which answer by how many whole range cells the range is off. Off by default, as in the

@@ -21,9 +21,9 @@ class Oscillator(Node):
     }
 
     mask_dbc_hz: tuple[tuple[Offset, Decibels], ...] = ()
-    """Points [offset from the carrier in Hz, single-sideband noise in dBc/Hz] in the order of their
-    offsets; the level may not rise. It is interpolated on logarithmic axes and held beyond the last
-    point: the floor. Empty, the default: no phase noise."""
+    """Points [offset from the carrier in Hz, single-sideband noise in dBc/Hz] by rising offset and
+    falling level; interpolated on logarithmic axes and constant beyond the last point. Empty, the
+    default: no phase noise."""
     locked: bool = True
     """Whether the oscillator is locked to one without noise: below the first point the level is
     held. If not, it goes on rising towards the carrier with the slope of the first two points.
@@ -234,9 +234,9 @@ class Converter(Node):
     bits: Annotated[int, Field(ge=1, le=24)] | None = None
     """Bits of each converter. null, the default: neither quantisation nor saturation."""
     full_scale_dbm: Power | None = None
-    """Power at the input of a sine that just fills the converters [dBm]. null, the default: an
-    automatic gain sets it 12 dB over the mean power of the strongest element in a chirp before the
-    frame's first, which leaves room for four equal waves."""
+    """Input power of a sine at the converters' full scale [dBm]. null, the default: an automatic
+    gain sets it 12 dB over the mean power of the strongest element in a chirp before the frame's
+    first."""
 
     @property
     def ideal(self) -> bool:

@@ -117,9 +117,9 @@ class Radio(Node):
     wider sweep gives finer range cells: 25 cm for an echo with the default, which is the
     paper's."""
     sampling_rate_hz: Positive = 20e6
-    """Rate of the complex samples behind the receiver's mixer [Hz]. With the bandwidth and the
-    samples it sets the longest delay that passes the filter: 256 m for an echo with the default,
-    which is the paper's. Receivers look at the half of it in which every data symbol arrives."""
+    """Rate of the complex IF samples [Hz]. It sets the longest delay that passes the filter: 256 m
+    for an echo with the default, the paper's. Receivers search the half that every data symbol
+    reaches."""
     samples_per_chirp: Annotated[int, Field(ge=16, le=65536)] = 1024
     """Samples taken of each chirp, an even number because half of the range cells carry the data
     symbols. More samples make chirps and frames longer. The default is the paper's."""
@@ -128,22 +128,20 @@ class Radio(Node):
     chirps resolve velocities more finely (0.25 m/s for an echo with the default, which is the
     paper's) and make the frame longer."""
     groups: Annotated[int, Field(ge=1, le=16)] = 3
-    """Chirp groups that are sent at once, each in a resource block of its own; at most the number
-    of transmit antennas. Every group carries data of its own. The default keeps all three transmit
-    antennas of the default array busy."""
+    """Chirp groups that are sent simultaneously, each in a resource block of its own and with its
+    own data; at most the number of transmit antennas. The default uses all three transmit antennas
+    of the default array."""
     mode: Literal["isac", "fmcw"] = "isac"
     """What the chirps are for. `isac`, the default and the paper's, carries data to passive
     terminals; `fmcw` is a plain radar without data, which sees all range cells."""
     scheme: Literal["simo", "tdm", "ddm", "bpm"] = "tdm"
-    """How the transmit antennas share the chirps, for `mode: fmcw`. `simo`: there is one antenna.
-    `tdm`, the default: one after the other. `ddm`: all at once, each in a Doppler band of its own
-    by a phase that advances from chirp to chirp. `bpm`: all at once, told apart by a Hadamard code
-    over the chirps."""
+    """How transmit antennas share the chirps, for `mode: fmcw`. `simo`: one antenna. `tdm`, the
+    default: one after the other. `ddm`: simultaneously, by a phase step per chirp (Doppler bands).
+    `bpm`: simultaneously, by a Hadamard code over the chirps."""
     sub_bands: Annotated[int, Field(ge=2, le=256)] | None = None
-    """Doppler bands that `scheme: ddm` divides the velocities into, or length of the codes of
-    `bpm`, a power of two; it divides `chirps_per_frame`. With more bands than transmit antennas the
-    full velocity stays unambiguous. null, the default: the least such number for `ddm`, the least
-    power of two that holds the antennas for `bpm`."""
+    """Doppler bands of `scheme: ddm`, or code length of `bpm` (a power of two); it divides
+    `chirps_per_frame`. More bands than antennas keep the full velocity unambiguous. null, the
+    default: the least number that holds the antennas."""
     chirp: Chirp | None = None
     """Timing of the chirp as a data sheet states it, for `mode: fmcw`, in place of `bandwidth_hz`,
     which follows. null, the default: `bandwidth_hz`, `sampling_rate_hz` and `samples_per_chirp` set
@@ -295,9 +293,9 @@ class Elements(Node):
     """The elements of one array in its plane, X to the right and Z upwards, in place of an L."""
 
     shape: Literal["positions", "linear", "planar", "ti_cascade"] = "positions"
-    """How the elements stand. `positions`, the default: one by one, as `positions` or `file` say.
-    `linear`: `columns` elements in a row along X. `planar`: `columns` times `rows`. `ti_cascade`:
-    those of TI's 4-chip cascade board, 12 for sending and 16 for receiving."""
+    """Arrangement of the elements. `positions`, the default: as `positions` or `file` list them.
+    `linear`: `columns` in a row along X. `planar`: `columns` times `rows`. `ti_cascade`: TI's
+    4-chip cascade board, 12 transmit and 16 receive antennas."""
     positions: (
         Annotated[tuple[tuple[Finite, Finite], ...], Field(max_length=MAX_ELEMENTS)] | None
     ) = None
@@ -389,13 +387,13 @@ class Array(Node):
     paper's, keeps the full unambiguous velocity; `conventional` goes round the antennas, which
     divides it by their number."""
     fall_back: bool = False
-    """Whether a transmitter sends the conventional schedule in place of the pseudo-random one as
-    long as a receiver finds too many paths for sparse recovery. Off by default: with the default
-    number of groups there is no need of sparse recovery."""
+    """Whether a transmitter sends the conventional schedule instead of the pseudo-random one while
+    a receiver finds too many paths for sparse recovery. Off by default: the default groups need no
+    sparse recovery."""
     element_pattern: Literal["isotropic", "sector", "cosine", "table"] = "cosine"
-    """Pattern of one element: `isotropic` in all directions; `sector` the same gain within the
-    field of view and none outside; `cosine`, the default, falls off from the boresight as a patch
-    antenna does; `table` is as `pattern` or `pattern_file` say, over `element_gain_dbi`."""
+    """Pattern of one element: `isotropic`; `sector`: constant within the field of view and zero
+    outside; `cosine`, the default: that of a patch antenna; `table`: as `pattern` or `pattern_file`
+    state, over `element_gain_dbi`."""
     pattern: AspectTable | None = None
     """Gain of one element by azimuth and elevation, relative to `element_gain_dbi` [dB], for
     `table`."""
@@ -403,9 +401,8 @@ class Array(Node):
     """CSV file with the columns azimuth_deg, elevation_deg and dbi, a row for each direction of a
     grid, in place of `pattern`; the path is relative to the scenario's folder."""
     element_gain_dbi: Decibels = 5.0
-    """Gain of one element on boresight over an isotropic one [dBi]. At most 0 with `isotropic` and
-    what the field of view leaves with `sector` (4.36 for 120 degrees), or the element would radiate
-    more than its power. The default is that of a patch antenna."""
+    """Gain of one element on boresight [dBi]. The limit is the directivity of the pattern: 0 with
+    `isotropic`, 4.36 with `sector` of 120 degrees. The default is that of a patch antenna."""
     field_of_view_deg: Annotated[float, Field(gt=0, le=180)] = 120.0
     """Full angle that the arrays look at, in azimuth as in elevation [degrees]. Targets outside
     count as out of view. The default is what the default spacing tells without ambiguity."""
@@ -503,9 +500,9 @@ class Noise(Node):
     """Noise figure of the receiver [dB], for `link_budget`: how far its noise is above the thermal
     noise. The default is that of a 77 GHz radar chip."""
     snr_db: Decibels = 10.0
-    """SNR of one IF sample at one antenna before any processing [dB], for `snr`. It is that of the
-    reference path (the strongest target at an active terminal, the line of sight at a passive one),
-    as if nothing hid it and it were in view. The default is far above where symbol errors begin."""
+    """SNR of one IF sample of the unobstructed reference path, for `snr` [dB]: the strongest target
+    at an active terminal, the line of sight at a passive one. The default is far above the onset of
+    symbol errors."""
 
 
 class RoleChange(Node):

@@ -37,11 +37,9 @@ class Propagation(Node):
     together. More reflections cost time and add weaker paths; the default finds single and double
     ones."""
     rays: Annotated[int, Field(ge=100, le=10_000_000)] = 60_000
-    """Rays that a terminal sends out at each time sample of its flight to find which walls a wave
-    may meet one after the other; five time samples are pooled (`accuracy.max_untraced_m` says how
-    far apart they are). More rays find paths over small faces more surely and take longer. Paths
-    that are found do not depend on it. The default misses none over the noise of a cell in cities
-    of some hundred metres."""
+    """Rays per terminal and time sample that search for chains of walls; five time samples are
+    pooled (`accuracy.max_untraced_m`). More rays find small faces more surely and take longer. The
+    default suffices in cities of some hundred metres."""
     ghosts: bool = True
     """Whether echoes of a target that also bounce off the city are simulated; a receiver takes them
     for targets. On by default, as in any street."""
@@ -68,17 +66,16 @@ class Clutter(Node):
     }
 
     model: Literal["none", "gaussian", "rayleigh", "field"] = "none"
-    """Kind of clutter. `none`, the default; with `noise.model: snr` it is the paper's "Gaussian
-    noise environment". `gaussian`: white noise beside the thermal noise. `rayleigh`, the paper's
-    urban model: a run of range cells that stand still. `field`: scatterers pinned to the city's
-    mesh, the same in all frames and links."""
+    """Kind of clutter. `none`, the default. `gaussian`: white noise in addition to thermal noise.
+    `rayleigh`, the paper's urban model: a run of static range cells. `field`: scatterers pinned to
+    the city's mesh, the same in all frames and links."""
     clutter_to_noise_db: Decibels = 0.0
     """Power of `gaussian` clutter over that of the thermal noise [dB]. By default they are
     alike."""
     level_db: Decibels = 10.0
-    """Mean power of one cell of `rayleigh` clutter over the reference path of the link [dB]: the
-    strongest target at an active terminal, the line of sight at a passive one, as if nothing hid
-    it. The default is the paper's."""
+    """Mean power of one cell of `rayleigh` clutter over the unobstructed reference path of the link
+    [dB]: the strongest target at an active terminal, the line of sight at a passive one. The
+    default is the paper's."""
     cells: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (40, 50)
     """Least and most consecutive range cells of `rayleigh` clutter; the number is drawn in between.
     The default is the paper's."""
@@ -87,10 +84,9 @@ class Clutter(Node):
     same to fix it; one way at an active terminal, path length at a passive one. The default is the
     paper's."""
     max_error_db: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] = 0.2
-    """Error that nine of ten cells keep to [dB], for `field`: of the mean clutter power in a range
-    cell of 4 m, and of noise plus mean clutter in a range-Doppler cell, under whose noise
-    scatterers are merged. A smaller error takes more scatterers. The default is far below the
-    fluctuation of clutter itself."""
+    """Error that nine of ten cells keep to, for `field` [dB]: of the mean clutter power in a 4 m
+    range cell, and of noise plus clutter in a range-Doppler cell. A smaller error takes more
+    scatterers. The default is far below clutter's own fluctuation."""
     cell_area_per_metre_m: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
     """Largest area that one scatterer stands for, per metre of distance to the nearest terminal's
     flight [m^2/m], for `field`. null, the default: what `max_error_db` asks for."""

@@ -33,32 +33,25 @@ class Receivers(Node):
     KEEPS_NULL: ClassVar[bool] = True
 
     velocity_method: Literal["auto", "omp", "pursuit", "latin_union", "conventional"] = "auto"
-    """How velocities are found. `latin_union`: all groups as one uniform sampling, where there are
-    as many as transmit antennas. `conventional`: the DFT over each antenna's equally spaced chirps,
-    which divides the unambiguous velocity by their number. `pursuit`: path by path, each taken out
-    whole off the grid, so that its sidelobes hide no weaker ones. `omp`: orthogonal matching
-    pursuit on the grid, the paper's for sparse sampling. `auto`, the default: `latin_union` where
-    all groups are received, `conventional` where the schedule is, else `pursuit`, or with
-    `refinement: grid` `omp`."""
+    """Velocity estimation. `latin_union`: all groups as one uniform sampling. `conventional`: the
+    DFT over each antenna's chirps. `pursuit`: path by path, off the grid. `omp`: on the grid, the
+    paper's for sparse sampling. `auto`, the default: the best for the schedule."""
     refinement: Literal["grid", "local", "joint"] = "local"
-    """How finely a detection is placed. `grid`: the middle of its range and Doppler cell, the
-    paper's. `local`, the default: maximum likelihood about each peak, at little cost. `joint`: all
-    paths at once on the samples, which reaches the Cramer-Rao bound and separates paths in one cell
-    by direction, but is slower."""
+    """How finely a detection is placed. `grid`: the middle of its cell, the paper's. `local`, the
+    default: maximum likelihood about each peak. `joint`: all paths at once on the samples, at the
+    Cramer-Rao bound, separating paths in one cell; slower."""
     symbol_decision: Annotated[str, SYMBOL_READERS] = "powers"
-    """How a passive terminal reads symbols. `powers`, the default and the paper's: the powers of
-    the receive antennas are added. `beams`: the antennas are added in phase towards the tracked
-    paths, with a log-likelihood ratio for every bit; the most sensitive."""
+    """How a passive terminal reads symbols. `powers`, the default and the paper's: sum of the
+    antennas' powers. `beams`: coherent sum towards the tracked paths, with a log-likelihood ratio
+    for every bit; the most sensitive."""
     separate_reference: bool = False
-    """Whether a passive terminal tells its line of sight apart from a wall's or the ground's
-    reflection in the same cell, by direction, before it believes its range. Costs time only in
-    frames where one wave does not explain the cell. Off by default, as in the paper."""
+    """Whether a passive terminal separates its line of sight, by direction, from a reflection in
+    the same cell before it uses the range. It costs time where one wave does not fit. Off by
+    default, as in the paper."""
     link_acquisition: Literal["pilots", "blind"] = "pilots"
-    """From which frames a passive terminal learns over which path it reads data. `pilots`, the
-    default and the paper's: its line of sight in frames without data. `blind`: any path, from data
-    frames too; those that wait for it are read some frames late. The terminal senses with its
-    line of sight, or over walls that the mesh explains where the transmitter says where it is
-    (`cooperation`)."""
+    """Frames in which a passive terminal finds the path that carries the data. `pilots`, the
+    default and the paper's: the line of sight in unmodulated frames. `blind`: any path, in data
+    frames too; some frames are then read late."""
     false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] = 1e-6
     """Probability that noise alone is taken for a detection in one cell of the range-Doppler map.
     The default gives about one false alarm in ten frames of the default size."""
@@ -67,18 +60,16 @@ class Receivers(Node):
     for `clutter_detector: angle_doppler`; those by `false_alarm_rate`, which is at most as high,
     may start one too. null, the default: the same rate."""
     gate_false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] | None = None
-    """Probability that noise alone is taken for a UAV where one is expected, by its track or, with
-    `cooperation`, by what a terminal says of its place: in all cells and directions of its gate
-    together, for `clutter_detector: angle_doppler`. Such detections carry tracks on and start none.
-    null, the default: no cell has a threshold of its own."""
+    """False alarm rate of a whole gate in which a track or, with `cooperation`, a report expects a
+    UAV, for `clutter_detector: angle_doppler`. Such detections update tracks and start none. null,
+    the default: no separate threshold."""
     guard_cells: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (3, 3)
-    """Cells in range and in Doppler on each side of a cell that are left out when its background is
-    measured, so that a target does not raise its own threshold. The default covers the main lobe of
-    the Hann window."""
+    """Cells in range and Doppler on each side of a cell that its background excludes, so that a
+    target does not raise its own threshold. The default covers the main lobe of the Hann window."""
     training_cells: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (8, 6)
-    """Cells in range and in Doppler on each side, beyond the guard cells, from which the background
-    of a cell is measured. More cells measure it better and follow its changes worse; the default
-    takes over a hundred before and behind."""
+    """Cells in range and Doppler on each side, beyond the guard cells, from which a cell's
+    background is estimated. More cells estimate it better and follow its changes worse; the default
+    takes over a hundred."""
     max_detections: Annotated[int, Field(ge=1, le=10_000)] = 64
     """Most detections that a terminal keeps of a frame, the strongest ones. The default is far more
     than a swarm has targets."""
@@ -86,31 +77,24 @@ class Receivers(Node):
     """Least range at which a terminal searches [m]; one way at an active terminal, path length at a
     passive one. The default leaves out the transmitter's leakage."""
     clutter_filter: Literal["none", "zero_doppler", "runs"] = "none"
-    """What is taken out before detection. `none`: nothing, the default. `zero_doppler`: what stands
-    still relative to an active terminal, in all range cells. `runs`, the paper's: the same in
-    runs of 15 occupied range cells and more only, which a passive terminal leaves out of its symbol
-    decision."""
+    """Clutter removal before detection. `none`, the default. `zero_doppler`: all that is static
+    relative to an active terminal. `runs`, the paper's: the same in runs of 15 and more occupied
+    range cells, which passive terminals leave out of the symbol decision."""
     clutter_detector: Annotated[str, DETECTORS] = "cfar"
-    """What an active terminal compares a cell with. `cfar`, the default: the cells around it.
-    `angle_doppler`: all antennas are added in phase towards every direction, and filtered with the
-    clutter's covariance where mesh and own velocity predict clutter; own velocity and clutter level
-    are corrected by the frame first."""
+    """Test of an active terminal's cells. `cfar`, the default: against the cells around.
+    `angle_doppler`: all antennas coherently towards every direction, whitened by the clutter
+    covariance that mesh and own motion predict."""
     passive_detector: Annotated[str, PASSIVE_DETECTORS] = "cfar"
-    """How a passive terminal finds what reflects to it. `cfar`, the default: cells that stand out
-    of those around. `beams`: strong paths are taken out, then the antennas are added in phase
-    towards every direction, and filtered with the clutter's covariance where the city's mesh and
-    the transmitter as it is tracked predict clutter. With fewer groups than transmit antennas it
-    is as `cfar`."""
+    """Test of a passive terminal's cells. `cfar`, the default: against the cells around. `beams`:
+    all antennas coherently towards every direction after removal of strong paths, whitened by the
+    predicted clutter; with fewer groups than transmit antennas as `cfar`."""
     active_every_frames: Annotated[int, Field(ge=1)] = 1
     """An active terminal processes one frame in so many; the others only carry data. By default it
     processes all."""
     self_calibration: Literal["none", "tracks", "positions"] = "none"
-    """Whether terminals find gains, phases and delays of their antennas and the response over the
-    chirp from strong paths, frame by frame, and take them out of their samples. `none`, the
-    default. `tracks`: from tracked paths, whose directions are as they were measured: what turns
-    all directions alike stays. `positions`: also from the terminals' positions, which they send
-    each other, and, where the active terminal's detector knows the city's mesh, from clutter, so
-    that directions and clocks are found too."""
+    """Whether terminals estimate and remove errors of their antennas, frame by frame. `none`, the
+    default. `tracks`: from tracked paths. `positions`: also from the terminals' reported positions
+    and the mesh's clutter, so that directions and clocks are found too."""
 
     def problems(self) -> Iterator[Problem]:
         if self.refinement == "grid" and self.velocity_method == "pursuit":

@@ -13,6 +13,6 @@ class Radio(settings.Radio):
     """How far the terminals' hardware is from ideal; `swarm.NAME.front_end` says it of one. By
     default it is ideal."""
     calibration: str | None = None
-    """File of a calibration that `isac-rt calibrate --out` wrote, relative to the scenario's
-    folder: what every receiver takes out of its samples before anything else. All terminals have a
-    board of this kind. null, the default: samples are taken as they are."""
+    """Calibration file of `isac-rt calibrate --out`, relative to the scenario's folder. Every
+    receiver removes these errors from its samples first; all terminals have a board of this kind.
+    null, the default: samples are used as they are."""

@@ -98,10 +98,9 @@ class Scenario(Node):
     noise: Noise = Noise()
     """How strong the receiver's noise is: by a link budget, the default, or by a stated SNR."""
     receiver_preset: Preset | None = None
-    """Settings of `receivers` and `tracking` by name, which the keys stated there override.
-    `paper`: the paper's to the letter. `plain`: better estimates, no knowledge of the city. `city`:
-    the mesh and the own motion tell clutter from targets. null, the default: `city` where paths are
-    traced in a city and the arrays are the paper's L, else `plain`."""
+    """Settings of `receivers` and `tracking` by name, which stated keys override. `paper`: the
+    paper's. `plain`: better estimates, no knowledge of the city. `city`: uses the mesh. null, the
+    default: `city` in a traced city with an L array, else `plain`."""
     receivers: Receivers = Receivers()
     """How terminals detect targets and decode data. By default by CFAR and added powers."""
     tracking: Tracking = Tracking()
@@ -109,12 +108,9 @@ class Scenario(Node):
     belief: Belief = Belief()
     """What terminals believe wrongly of themselves and of the city. By default nothing."""
     cooperation: Literal["none", "tracks", "detections"] = "none"
-    """What terminals tell each other of what they see. `none`, the default: nothing. `tracks`:
-    their confirmed tracks and their own position, an active terminal with its data, a passive one
-    by feedback at `access.feedback_rate_bps`; each makes one picture of what it sees and receives.
-    `detections`: the detections that their tracks rest on instead; each runs one filter over all of
-    them, with the errors of poses and clocks as states. What is sent otherwise does not depend on
-    it; receivers of the preset `city` use what they are told."""
+    """Exchange between terminals. `none`, the default. `tracks`: confirmed tracks and own
+    positions, with an active terminal's data or a passive one's feedback; each terminal fuses them.
+    `detections`: detections instead, in one filter with pose and clock errors as states."""
     compare: dict[Name, ReceiverSet] = Field({})
     """Further sets of receivers by name, which receive the same samples. By default none."""
 

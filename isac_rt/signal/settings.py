@@ -25,16 +25,13 @@ class Accuracy(Node):
     `propagation.weakest_path_db` allow. `everything`: nothing is left out, rays search for walls in
     every frame."""
     max_phase_error_rad: Positive = 0.05
-    """Most by which plane wavefronts and straight flight together may turn the phase of a path at
-    any element and chirp [rad], for `budget`. Directions that turn within a frame are modelled in
-    no run and come on top (1.2 rad for an echo at 3.5 m and 28 m/s across); `isac-rt plan` and the
-    summary state them. The default costs at most 0.01 dB of the path's power."""
+    """Bound of the phase error of plane wavefronts and straight flight together, at any element and
+    chirp [rad], for `budget`. Rotation within a frame is not modelled (`isac-rt plan` states it).
+    The default costs at most 0.01 dB."""
     max_untraced_m: Annotated[float, Field(ge=0)] = 2.0
-    """Farthest that a terminal flies between two time samples, places from which rays search for
-    chains of walls [m], for `budget`; 0: they search from where it is in each frame. A longer way
-    is faster and may miss paths over walls that are seen for a shorter way only. Where the chains
-    run, and which of them are free, is found out in every frame. The default is shorter than walls
-    are wide."""
+    """Longest flight between two time samples, from which rays search for chains of walls [m], for
+    `budget`; 0: from every frame. A higher value is faster and may miss short-lived paths. The
+    default is shorter than walls are wide."""
 
     def applies(self, name: str) -> bool:
         return name == "preset" or self.preset == "budget"

@@ -20,8 +20,8 @@ class Tracking(Node):
 
     acceleration_std_mps2: Positive = 3.0
     """Standard deviation of a UAV's acceleration along each axis, held for about a second (Singer's
-    model) [m/s^2]. A higher value follows turns more quickly and smooths less; the default is the
-    limit that PX4 sets for multicopters and covers severe gusts."""
+    model) [m/s^2]. A higher value follows turns more quickly and smooths less; the default is PX4's
+    limit for multicopters."""
     gate_probability: Annotated[float, Field(gt=0.5, lt=1)] = 0.999
     """Probability that a detection of a tracked UAV falls within the gate about its prediction. A
     higher value loses fewer detections and lets more false ones in; the default loses one in a
@@ -40,16 +40,9 @@ class Tracking(Node):
     one that was seen for less long ends after as many frames as it was seen in. null, the default:
     only `drop_misses` counts."""
     births: Literal["all", "unexplained"] = "all"
-    """Detections that start tracks. `all`, the default. `unexplained`: not those where the city's
-    mesh shows the terminal itself, or a passive one its transmitter, by one or two walls, nor those
-    at the edge of the view, nor those on a face of the mesh, nor those that stand still beside each
-    other as a building does that the mesh lacks. A track is confirmed only if two of its detections
-    could have started one, and not if it lies in a face or behind a wall, or is a wall's image of a
-    nearer one, or of a nearer UAV that others told of (`cooperation`). One that fits such an
-    image, or lies behind a wall, in three frames in a row ends. Two confirmed ones within 0.5 m of
-    which no frame shows both are one. With `cooperation` a passive terminal confirms none before
-    its sixth frame: until then the active one cannot have told it what flies near its line of
-    sight."""
+    """Detections that start tracks. `all`, the default. `unexplained`: not those that the city
+    explains, as images of terminals or UAVs, surfaces, or static clutter that the mesh lacks;
+    confirmation and deletion use the same tests (docs/receiver.md)."""
 
     @property
     def needs_mesh(self) -> bool:

@@ -86,21 +86,20 @@ class City(Node):
     """Material of the pieces of a `mesh` that neither `material_map` nor their names tell. The
     default, concrete, is the most common."""
     material_map: dict[str, str] = Field({})
-    """Material by the name of a node, geometry or material of a `mesh` file; by the type of an
-    object or surface of CityJSON, such as SolitaryVegetationObject. By default these names are
-    looked up in the table of materials as they are, and a CityJSON type has the material that `new`
-    prints."""
+    """Material by the name of a node, geometry or material of a `mesh` file, or by the type of a
+    CityJSON object or surface. By default names are looked up in the table of materials; `new`
+    prints CityJSON's."""
     coordinates: Literal["auto", "metres", "lonlat"] = "auto"
     """Coordinates of `footprints`: `metres`, `lonlat` for longitude and latitude in degrees, or
     `auto`, the default: told by their size."""
     crs: str | None = None
-    """Coordinate reference system of a `footprints` file, such as EPSG:2056, which goes before what
-    the file says. Grids in true metres are kept, all others projected about the origin. By default
-    what the file says, else told by the size of its numbers."""
+    """Coordinate reference system of a `footprints` file, such as EPSG:2056; it overrides the
+    file's. Grids in true metres are kept, others projected about the origin. By default the file's,
+    or inferred from the size of its numbers."""
     origin: Vector | None = None
-    """Point of a `footprints` or `mesh` file [x, y, z] that becomes the world's origin, in the
-    coordinates and units of the file. By default that of the file; of footprints in longitude and
-    latitude the middle of the buildings at height 0."""
+    """Point of a `footprints` or `mesh` file [x, y, z], in the file's coordinates and units, that
+    becomes the world's origin. By default the file's origin; for longitude and latitude, the middle
+    of the buildings at height 0."""
     terrain: str | None = None
     """Path of a GeoTIFF with heights of the ground [m], relative to the scenario's folder, for
     `footprints`; needs the extra `cities`. By default the relief of CityJSON, else a ground that is
@@ -144,8 +143,8 @@ class City(Node):
     default as many."""
     keep_radius_m: Positive | None = None
     """Distance from the middle of the flight within which the city is kept [m]. A smaller city is
-    traced faster, but what is left out neither reflects nor shadows; a face that reaches beyond
-    stays, and scatters nothing there. By default all of it is kept."""
+    traced faster, but what is left out neither reflects nor occludes. By default all of it is
+    kept."""
     materials: dict[str, MaterialOverride] = Field({})
     """Properties to change, by the name of the material. By default the table of ITU-R P.2040
     holds."""
@@ -215,10 +214,9 @@ class Rcs(Node):
     """Radar cross-section of a UAV: how strong its echo is."""
 
     model: Literal["constant", "tr38901", "relative", "table"] = "tr38901"
-    """Where the cross-section comes from: `constant` is `value_dbsm`; `tr38901`, the default, is
-    the UAV of 3GPP TR 38.901 of the given `size`; `relative` sets the echo's level by `level_db`
-    whatever the geometry, as the paper does; `table` is that of `table` or `file` towards the
-    bisector of both directions."""
+    """Radar cross-section: `constant`: `value_dbsm`; `tr38901`, the default: the UAV of 3GPP TR
+    38.901 of the given `size`; `relative`: echo level `level_db` whatever the geometry, as in the
+    paper; `table`: `table` or `file`, towards the bistatic bisector."""
     table: AspectTable | None = None
     """Cross-section by azimuth and elevation in the UAV's frame [dBsm], for `table`."""
     file: str | None = None
@@ -231,10 +229,9 @@ class Rcs(Node):
     """Which UAV of TR 38.901 is meant, for `tr38901`: `small`, the default, reflects alike to all
     sides; `large` has lobes to front, back, sides, top and bottom."""
     fluctuation_db: Annotated[float, Field(ge=0, le=20)] | None = None
-    """Standard deviation by which the cross-section varies smoothly with the aspect [dB], for
-    `tr38901` and `constant`; the same on all links and frames, and without effect on the mean
-    power. The default is the report's for `tr38901` (3.74 for a small UAV, 2.50 for a large one),
-    and none for `constant`."""
+    """Standard deviation of the cross-section over the aspect [dB], for `tr38901` and `constant`;
+    the same on all links, without effect on the mean power. The default is 3GPP's for `tr38901`
+    (3.74 small, 2.50 large), else none."""
     level_db: Decibels = -20.0
     """Level of the reflected path over the reference path of its link [dB], for `relative`: the
     line of sight at a passive terminal, the strongest other target at an active one. The default
@@ -259,18 +256,18 @@ class Waypoint(Node):
     position_m: Vector
     """Position at that time: x east, y north, z up [m]."""
     attitude_deg: Vector | None = None
-    """How the UAV is turned at that time: yaw (of its nose, clockwise from north), pitch (nose up)
-    and roll (right side down) [degrees]; at all waypoints or at none. It turns smoothly in between.
-    null, the default: `boresight` says it."""
+    """Attitude at that time: yaw (clockwise from north), pitch (nose up) and roll (right side down)
+    [degrees], at all waypoints or at none, interpolated smoothly. null, the default: `boresight`
+    states it."""
 
 
 class Formation(Node):
     """Several UAVs from one: all fly the same way, apart from each other."""
 
     shape: Literal["line", "column", "wedge", "grid"]
-    """How they stand about the direction in which they set out: `line` to the right and left in
-    turn, `column` behind each other, `wedge` behind to the right and left in turn, `grid` in rows
-    to the right, each behind the one before."""
+    """Arrangement about the direction of flight: `line` to the right and left in turn, `column`
+    behind each other, `wedge` behind to the right and left in turn, `grid` in rows to the right,
+    each behind the one before."""
     spacing_m: Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
     """Distance of neighbours along the line, the column and the rows, and sideways and behind in
     the wedge [m]."""
@@ -312,9 +309,9 @@ class Uav(Node):
     """Two places or more with their times, which the UAV flies through on a smooth curve; in place
     of `position_m` and `velocity_mps`."""
     flight: str | None = None
-    """CSV file with the columns time_s, x, y, z [m], or time_s, lat, lon, alt over a map, and, if
-    known, yaw_deg, pitch_deg, roll_deg, in place of `waypoints`, at most 5000 rows; x, y, z may be
-    in the grid of a city with `city.origin`. The path is relative to the scenario's folder."""
+    """CSV file with the columns time_s, x, y, z [m], or time_s, lat, lon, alt, and optionally
+    yaw_deg, pitch_deg, roll_deg, instead of `waypoints`; at most 5000 rows. The path is relative to
+    the scenario's folder."""
     mount_deg: Vector = (0.0, 0.0, 0.0)
     """How the arrays are turned against the UAV's own frame: yaw to the right, pitch up, roll
     [degrees], as of a radar that looks sideways from a car. By default they look ahead."""
