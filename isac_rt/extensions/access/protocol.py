@@ -16,7 +16,8 @@ block.
 
 Whoever sends here sends `hold` later than its clock says, so that a clock that is ahead by more
 than the path's delay is received all the same; receivers know it. Not modelled: the passage of
-round 1's estimate from one end to the other, taken as free of errors."""
+round 1's estimate and of both ends' positions and velocities to where the clock is computed, taken
+as free of errors."""
 
 from __future__ import annotations
 
@@ -32,6 +33,8 @@ from isac_rt.extensions.access.synchronise import (
     ClockEstimate,
     Round,
     estimate_clock,
+    measured_alone,
+    path_acceleration,
     round_of,
 )
 from isac_rt.frame.antennas import Antennas
@@ -324,8 +327,7 @@ def _join(air: _Air, at: str, block: int) -> dict[Link, LinkState]:
     for pt in pts:
         got = answers[pt]
         message = None if got is None else got[1]
-        both = [r for r in (first.get(pt), second.get(pt)) if r is not None]
-        clock = EXTERNAL if n.external_clock else estimate_clock(both) if len(both) == 2 else None
+        clock = EXTERNAL if n.external_clock else _clock(n, at, pt, first.get(pt), second.get(pt))
         out[Link(at, pt)] = LinkState(
             received_block=None if got is None else got[0],
             message=message,
@@ -370,10 +372,23 @@ def _first_received(votes: Sequence[tuple[int, Message]], width: int) -> tuple[i
     return None if agreed is None or 2 * len(blocks) < width else (min(blocks), agreed)
 
 
+def _clock(
+    n: Network, at: str, pt: str, first: Round | None, second: Round | None
+) -> ClockEstimate | None:
+    """Return a link's clock from both rounds and the flights that its ends report; None where a
+    round was missed."""
+    if first is None or second is None:
+        return None
+    poses = (n.scene(r.time, [])[0] for r in (first, second))
+    before, after = ((p[at], p[pt]) for p in poses)
+    acceleration = path_acceleration(before, after, second.time - first.time)
+    return estimate_clock([first, second], acceleration)
+
+
 def _line_of_sight(air: _Air, cube: IFCube) -> Detections:
-    return receive_passive(
-        cube, air.n.antennas, air.n.receivers, air.n.dpsk_order, None, False
-    ).detections
+    n = air.n
+    found = receive_passive(cube, n.antennas, n.receivers, n.dpsk_order, None, False).detections
+    return measured_alone(found, cube, n.antennas)
 
 
 def _first_round(

@@ -11,22 +11,34 @@ the passive terminal's and adds to the delay; in round 2 the same clocks add wit
     y_2 = \dot\tau(t) - \dot\delta
 
 A drift of 0.01 ppm is 3 m/s of apparent velocity, and a motion of 10 m/s between rounds 8 ms apart
-is 0.08 m of apparent offset: both are solved for, with the path's acceleration as an unknown of
-known spread, so that the rounds may be apart.
+is 0.08 m of apparent offset: both are solved for. The path's acceleration between the rounds
+follows from the positions and velocities that both ends report.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
+from isac_rt.receive.estimate import (
+    HALF_WIDTH,
+    PULL,
+    LocalSpectra,
+    directions,
+    excess,
+    hann_response,
+    refine,
+)
+from isac_rt.receive.known import Known
+from isac_rt.receive.maps import slow_window
+from isac_rt.receive.spectrum import cleaned
 from isac_rt.receive.types import Detections
-
-ACCELERATION_STD = 5.0
-"""Spread of the range's acceleration [m/s^2]: manoeuvres, and v^2/R of passing by."""
+from isac_rt.world.swarm import Pose
 
 
 @dataclass(frozen=True)
@@ -93,14 +105,165 @@ EXTERNAL = ClockEstimate(
 """Clocks that an external source keeps equal: nothing to estimate, stage 2 is left out."""
 
 
-def round_of(
-    detections: Detections, time: float, forward: bool, *, cell: float, held: float = 0.0
-) -> Round | None:
-    """The reference of a reception as a round: the strongest detection within a range cell of the
-    earliest sure one.
+def line_of_sight(detections: Detections, cell: float) -> int | None:
+    """Return the row of the strongest detection within a range cell [m] of the earliest sure one.
 
     One group alone samples an antenna's chirps so sparsely that a strong path leaves Doppler
     sidelobes at its own range, and one of these may seem earlier by less than a cell.
+    """
+    which = np.flatnonzero(detections.is_reference)
+    if which.size == 0:
+        return None
+    near = np.abs(detections.range - detections.range[which[0]]) < cell
+    return int(np.where(near, detections.snr, -np.inf).argmax())
+
+
+def measured_alone(detections: Detections, cube: IFCube, antennas: Antennas) -> Detections:
+    """Return the detections of an unmodulated frame with the line of sight measured once more, and
+    its deviations as noise, other detections and what a single wave does not explain make them.
+
+    The floors of `standard_deviations` stand for what is not known of other paths; around a line of
+    sight they are known, but for those within two cells that no detector tells apart. A line of
+    sight that is not a single wave stays as it is.
+    """
+    known = Known.unmodulated(cube.waveform, cube.schedule, antennas, 1)
+    w, d = known.waveform, detections
+    i = line_of_sight(d, w.range_cell(1))
+    if i is None or not d.starts[i]:
+        return d
+    spectra, known = cleaned(cube, known)
+    delay, rate = d.range / SPEED_OF_LIGHT, d.velocity / SPEED_OF_LIGHT
+    beat = w.beat_cells(delay, rate, 0.0)
+    row = min(max(round(float(beat[i])), 0), spectra.shape[2] - 1)
+    found = refine(LocalSpectra(spectra, known, row), delay[i], rate[i])
+    weights = _Weights.of(known)
+    snr = float((np.abs(found.channels) ** 2).mean()) / _noise(spectra, known)
+    variance = weights.noise(snr)
+    # what the sender's elements leave, whose delays are unknown: it appears at other velocities
+    reach = np.linalg.norm(antennas.tx_positions, axis=1).max() / w.range_cell(1)
+    own = (d.snr < (np.pi * reach) ** 2 * d.snr[i]) & (np.abs(beat - beat[i]) < 2)
+    own[i] = True
+    for q in np.flatnonzero(~own):
+        share = d.snr[q] / d.snr[i] * _beam(d.direction[q] - d.direction[i], known)
+        variance += share * weights.pull(beat[q] - beat[i], rate[q] - rate[i], w)
+    others = excess(
+        found.channels[None],
+        np.array([found.delay]),
+        directions(found.channels[None], np.array([found.delay]), known),
+        np.array([snr * weights.gain / w.num_tx]),
+        known,
+    )
+    pull = PULL * others / (1 + others) * np.array([w.range_cell(1), w.velocity_cell(1)])
+    distance, speed, std = d.range.copy(), d.velocity.copy(), d.std.copy()
+    distance[i], speed[i] = found.delay * SPEED_OF_LIGHT, found.delay_rate * SPEED_OF_LIGHT
+    std[i, :2] = np.hypot(SPEED_OF_LIGHT * np.sqrt(variance), pull)
+    return replace(d, range=distance, velocity=speed, std=std)
+
+
+def _noise(spectra: np.ndarray, known: Known) -> float:
+    """Return the noise's power per sample: the median over the spectra is ln 2 of an exponential's
+    mean, and the few rows of paths do not move it."""
+    w, median = known.waveform, float(np.median(spectra.real**2 + spectra.imag**2))
+    window = hann(np.arange(w.num_samples), w.window_length)
+    return median / (np.log(2) * float((window**2).sum()))
+
+
+def _beam(apart: np.ndarray, known: Known) -> float:
+    """Return the power that the receivers in phase towards one direction take from another, whose
+    cosines (2,) are `apart`; 1 where a direction is unknown."""
+    if not np.isfinite(apart).all():
+        return 1.0
+    turn = known.wavenumber * known.antennas.rx_positions[:, [0, 2]] @ apart
+    return float(np.abs(np.exp(1j * turn).mean()) ** 2)
+
+
+@dataclass(frozen=True)
+class _Weights:
+    r"""Weights and phase slopes of samples and chirps in the `refine` estimate of one path.
+
+    A phase slope x = d phase / d parameter, about its weighted mean, that is fitted with weights W
+    to a path with another wave exp(j psi) beside it errs by
+
+    .. math::
+
+        \frac{\sum W x\, \mathrm{Im}\, e^{j\psi}}{\sum W x^2}
+
+    W is the square of the range window, which data and template have both, times the slow-time
+    window. Each transmit antenna has a phase of its own, so that slow time counts about its own
+    mean, and other waves have another phase at each.
+
+    Attributes
+    ----------
+    fast, slow : weights of samples (N,) and chirps (M, P)
+    ramp, turn : phase per delay [rad/s] and per delay rate [rad]
+    schedule : (M, P) transmit antennas
+    num_rx : receive antennas
+    """
+
+    fast: np.ndarray
+    slow: np.ndarray
+    ramp: np.ndarray
+    turn: np.ndarray
+    schedule: np.ndarray
+    num_rx: int
+
+    @classmethod
+    def of(cls, known: Known) -> _Weights:
+        """Return those of a frame."""
+        w = known.waveform
+        fast = hann(np.arange(w.num_samples), w.window_length) ** 2
+        slow = np.broadcast_to(slow_window(w), known.schedule.shape).astype(float)
+        ramp = 2 * np.pi * w.slope * w.sample_interval * np.arange(w.num_samples)
+        turn = 2 * np.pi * w.effective_carrier * known.times
+        for antenna in range(w.num_tx):
+            mine = known.schedule == antenna
+            turn[mine] -= np.average(turn[mine], weights=slow[mine])
+        ramp -= np.average(ramp, weights=fast)
+        return cls(fast, slow, ramp, turn, known.schedule, known.antennas.num_rx)
+
+    @property
+    def _curvature(self) -> np.ndarray:
+        """Sums of W x^2 (2,) of delay and delay rate."""
+        delay = (self.fast * self.ramp**2).sum() * self.slow.sum()
+        return np.array([delay, self.fast.sum() * (self.slow * self.turn**2).sum()])
+
+    @property
+    def gain(self) -> float:
+        """SNR of an amplitude fitted to all samples of a receiver, over that of a sample."""
+        weight = self.fast.sum() * self.slow.sum()
+        return float(weight**2 / ((self.fast**2).sum() * (self.slow**2).sum()))
+
+    def noise(self, snr: float) -> np.ndarray:
+        """Variances (2,) of delay and delay rate in white noise, at an SNR of a sample."""
+        fast, slow = self.fast**2, self.slow**2
+        delay = (fast * self.ramp**2).sum() * slow.sum()
+        spread = np.array([delay, fast.sum() * (slow * self.turn**2).sum()])
+        return spread / self._curvature**2 / (2 * snr * self.num_rx)
+
+    def pull(self, cells: float, rate: float, waveform: Waveform) -> np.ndarray:
+        """Variances (2,) of delay and delay rate by a wave of the path's own power and unknown
+        phase, whose beat is `cells` and whose delay rate is `rate` from it: the match takes the
+        rows of `LocalSpectra` alone."""
+        rows = np.arange(-HALF_WIDTH, HALF_WIDTH + 1)
+        step = 1e-3
+        here, other = hann_response(waveform, rows), hann_response(waveform, rows - cells)
+        slope = (hann_response(waveform, rows + step) - hann_response(waveform, rows - step)) / (
+            2 * step * waveform.delay_step
+        )
+        slow = self.slow * np.exp(1j * self.turn * rate)
+        powers = [
+            sum(abs(each[self.schedule == a].sum()) ** 2 for a in np.unique(self.schedule))
+            for each in (slow, self.turn * slow)
+        ]
+        delay = (slope @ other / (slope @ slope) / self.slow.sum()) ** 2
+        turned = (here @ other / (here @ here) / (self.slow * self.turn**2).sum()) ** 2
+        return np.array([delay * powers[0], turned * powers[1]]) / 2
+
+
+def round_of(
+    detections: Detections, time: float, forward: bool, *, cell: float, held: float = 0.0
+) -> Round | None:
+    """The line of sight of a reception as a round (`line_of_sight`).
 
     Parameters
     ----------
@@ -110,11 +273,9 @@ def round_of(
     cell : size of a range cell [m]
     held : how much later than its clock the sender sent on purpose [s]
     """
-    which = np.flatnonzero(detections.is_reference)
-    if which.size == 0:
+    i = line_of_sight(detections, cell)
+    if i is None:
         return None
-    near = np.abs(detections.range - detections.range[which[0]]) < cell
-    i = np.where(near, detections.snr, -np.inf).argmax()
     return Round(
         time=time,
         forward=forward,
@@ -125,16 +286,30 @@ def round_of(
     )
 
 
-def estimate_clock(
-    rounds: Sequence[Round], acceleration_std: float = ACCELERATION_STD
-) -> ClockEstimate:
+def path_acceleration(
+    before: tuple[Pose, Pose], after: tuple[Pose, Pose], interval: float
+) -> float:
+    """Return the mean acceleration of a path's length between two rounds [m/s^2], as both ends
+    report their positions and velocities there: manoeuvres, and v^2/R of passing by.
+
+    Only the change is used, so that errors of their navigation, which last longer than the rounds,
+    cancel but for their share of v^2/R.
+    """
+    speeds = []
+    for one, other in (before, after):
+        away = other.position - one.position
+        speeds.append(away @ (other.velocity - one.velocity) / np.linalg.norm(away))
+    return float((speeds[1] - speeds[0]) / interval)
+
+
+def estimate_clock(rounds: Sequence[Round], acceleration: float = 0.0) -> ClockEstimate:
     """Clock and path from rounds of both directions by least squares with the measurements'
     covariance.
 
     Parameters
     ----------
     rounds : at least one in each direction, in any order
-    acceleration_std : spread of the path's acceleration, constant over the rounds [m/s^2]
+    acceleration : of the path's length, constant over the rounds [m/s^2] (`path_acceleration`)
 
     Raises
     ------
@@ -142,7 +317,7 @@ def estimate_clock(
 
     Notes
     -----
-    With one round each way: drift = (v1 - v2)/2c, offset = (r1 - r2 + v2 dt)/2c.
+    With one round each way: drift = (v1 - v2 + a dt)/2c, offset = (r1 - r2 + v2 dt - a dt^2/2)/2c.
     """
     if len({r.forward for r in rounds}) < 2:
         raise ValueError(
@@ -152,22 +327,16 @@ def estimate_clock(
     rows, values, stds = [], [], []
     for r in rounds:
         t, s = r.time - start, 1.0 if r.forward else -1.0
-        # unknowns in metres: c offset, c drift, range, velocity, acceleration
-        rows += [[s, s * t, 1.0, t, t * t / 2], [0.0, s, 0.0, 1.0, t]]
-        values += [r.range, r.velocity]
+        # unknowns in metres: c offset, c drift, range, velocity
+        rows += [[s, s * t, 1.0, t], [0.0, s, 0.0, 1.0]]
+        values += [r.range - acceleration * t * t / 2, r.velocity - acceleration * t]
         stds += [r.range_std, r.velocity_std]
-    rows.append([0.0, 0.0, 0.0, 0.0, 1.0])
-    values.append(0.0)
-    stds.append(acceleration_std)
     weight = 1 / np.array(stds)
     design = np.array(rows) * weight[:, None]
     solution = np.linalg.lstsq(design, np.array(values) * weight, rcond=None)[0]
     inverse = np.linalg.pinv(design)
-    covariance = (inverse @ inverse.T)[:4, :4]
     unit = np.array([1 / SPEED_OF_LIGHT, 1 / SPEED_OF_LIGHT, 1.0, 1.0])
-    offset, drift, distance, velocity = solution[:4] * unit
-    covariance = covariance * np.outer(unit, unit)
+    offset, drift, distance, velocity = (solution * unit).tolist()
+    covariance = inverse @ inverse.T * np.outer(unit, unit)
     covariance.setflags(write=False)
-    return ClockEstimate(
-        start, float(offset), float(drift), float(distance), float(velocity), covariance
-    )
+    return ClockEstimate(start, offset, drift, distance, velocity, covariance)

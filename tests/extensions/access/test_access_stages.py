@@ -115,6 +115,7 @@ class Air:
             "hot_chirps": hot_chirps,
             "read": read,
             "receive_passive": receive_passive,
+            "measured_alone": lambda found, cube, antennas: found,
         }
         for name, stand_in in stand_ins.items():
             monkeypatch.setattr(protocol, name, stand_in)
