@@ -24,7 +24,7 @@ import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, hann
 from isac_rt.receive.estimate import (
     HALF_WIDTH,
     PULL,
@@ -136,23 +136,17 @@ def measured_alone(detections: Detections, cube: IFCube, antennas: Antennas) -> 
     beat = w.beat_cells(delay, rate, 0.0)
     row = min(max(round(float(beat[i])), 0), spectra.shape[2] - 1)
     found = refine(LocalSpectra(spectra, known, row), delay[i], rate[i])
-    weights = _Weights.of(known)
-    snr = float((np.abs(found.channels) ** 2).mean()) / _noise(spectra, known)
-    variance = weights.noise(snr)
     # what the sender's elements leave, whose delays are unknown: it appears at other velocities
     reach = np.linalg.norm(antennas.tx_positions, axis=1).max() / w.range_cell(1)
     own = (d.snr < (np.pi * reach) ** 2 * d.snr[i]) & (np.abs(beat - beat[i]) < 2)
     own[i] = True
-    for q in np.flatnonzero(~own):
-        share = d.snr[q] / d.snr[i] * _beam(d.direction[q] - d.direction[i], known)
-        variance += share * weights.pull(beat[q] - beat[i], rate[q] - rate[i], w)
-    others = excess(
-        found.channels[None],
-        np.array([found.delay]),
-        directions(found.channels[None], np.array([found.delay]), known),
-        np.array([snr * weights.gain / w.num_tx]),
-        known,
-    )
+    turn = known.wavenumber * (d.direction - d.direction[i]) @ antennas.rx_positions[:, [0, 2]].T
+    beam = np.abs(np.exp(1j * np.nan_to_num(turn)).mean(axis=1)) ** 2
+    waves = np.stack([d.snr / d.snr[i] * beam, beat - beat[i], rate - rate[i]], axis=1)[~own]
+    snr = float((np.abs(found.channels) ** 2).mean()) / _noise(spectra, known)
+    variance = _variances(known, snr, waves)
+    at = found.channels[None], np.array([found.delay])
+    others = excess(*at, directions(*at, known), d.snr[[i]], known)
     pull = PULL * others / (1 + others) * np.array([w.range_cell(1), w.velocity_cell(1)])
     distance, speed, std = d.range.copy(), d.velocity.copy(), d.std.copy()
     distance[i], speed[i] = found.delay * SPEED_OF_LIGHT, found.delay_rate * SPEED_OF_LIGHT
@@ -168,96 +162,44 @@ def _noise(spectra: np.ndarray, known: Known) -> float:
     return median / (np.log(2) * float((window**2).sum()))
 
 
-def _beam(apart: np.ndarray, known: Known) -> float:
-    """Return the power that the receivers in phase towards one direction take from another, whose
-    cosines (2,) are `apart`; 1 where a direction is unknown."""
-    if not np.isfinite(apart).all():
-        return 1.0
-    turn = known.wavenumber * known.antennas.rx_positions[:, [0, 2]] @ apart
-    return float(np.abs(np.exp(1j * turn).mean()) ** 2)
+def _variances(known: Known, snr: float, waves: np.ndarray) -> np.ndarray:
+    r"""Return the variances (2,) of delay and delay rate of the `refine` estimate of one path.
 
+    A phase slope x about its weighted mean errs by :math:`\sum W x\, \mathrm{Im}\, n / \sum W x^2`.
+    For white noise W is the square of the range window, which data and template have both, times
+    the slow-time window. Each transmit antenna has a phase of its own, so that slow time counts
+    about its own mean. Other waves have another phase at each, and are matched in the rows of
+    `LocalSpectra` alone.
 
-@dataclass(frozen=True)
-class _Weights:
-    r"""Weights and phase slopes of samples and chirps in the `refine` estimate of one path.
-
-    A phase slope x = d phase / d parameter, about its weighted mean, that is fitted with weights W
-    to a path with another wave exp(j psi) beside it errs by
-
-    .. math::
-
-        \frac{\sum W x\, \mathrm{Im}\, e^{j\psi}}{\sum W x^2}
-
-    W is the square of the range window, which data and template have both, times the slow-time
-    window. Each transmit antenna has a phase of its own, so that slow time counts about its own
-    mean, and other waves have another phase at each.
-
-    Attributes
+    Parameters
     ----------
-    fast, slow : weights of samples (N,) and chirps (M, P)
-    ramp, turn : phase per delay [rad/s] and per delay rate [rad]
-    schedule : (M, P) transmit antennas
-    num_rx : receive antennas
+    snr : of a sample
+    waves : (K, 3) power over the path's, beat and delay rate from it [1, cells, 1]
     """
+    w, sent = known.waveform, known.schedule
+    fast = hann(np.arange(w.num_samples), w.window_length) ** 2
+    slow = np.broadcast_to(slow_window(w), sent.shape).astype(float)
+    ramp = 2 * np.pi * w.slope * w.sample_interval * np.arange(w.num_samples)
+    ramp -= np.average(ramp, weights=fast)
+    turn = 2 * np.pi * w.effective_carrier * known.times
+    each = [sent == antenna for antenna in np.unique(sent)]
+    for mine in each:
+        turn[mine] -= np.average(turn[mine], weights=slow[mine])
+    size, curve = slow.sum(), (slow * turn**2).sum()
 
-    fast: np.ndarray
-    slow: np.ndarray
-    ramp: np.ndarray
-    turn: np.ndarray
-    schedule: np.ndarray
-    num_rx: int
-
-    @classmethod
-    def of(cls, known: Known) -> _Weights:
-        """Return those of a frame."""
-        w = known.waveform
-        fast = hann(np.arange(w.num_samples), w.window_length) ** 2
-        slow = np.broadcast_to(slow_window(w), known.schedule.shape).astype(float)
-        ramp = 2 * np.pi * w.slope * w.sample_interval * np.arange(w.num_samples)
-        turn = 2 * np.pi * w.effective_carrier * known.times
-        for antenna in range(w.num_tx):
-            mine = known.schedule == antenna
-            turn[mine] -= np.average(turn[mine], weights=slow[mine])
-        ramp -= np.average(ramp, weights=fast)
-        return cls(fast, slow, ramp, turn, known.schedule, known.antennas.num_rx)
-
-    @property
-    def _curvature(self) -> np.ndarray:
-        """Sums of W x^2 (2,) of delay and delay rate."""
-        delay = (self.fast * self.ramp**2).sum() * self.slow.sum()
-        return np.array([delay, self.fast.sum() * (self.slow * self.turn**2).sum()])
-
-    @property
-    def gain(self) -> float:
-        """SNR of an amplitude fitted to all samples of a receiver, over that of a sample."""
-        weight = self.fast.sum() * self.slow.sum()
-        return float(weight**2 / ((self.fast**2).sum() * (self.slow**2).sum()))
-
-    def noise(self, snr: float) -> np.ndarray:
-        """Variances (2,) of delay and delay rate in white noise, at an SNR of a sample."""
-        fast, slow = self.fast**2, self.slow**2
-        delay = (fast * self.ramp**2).sum() * slow.sum()
-        spread = np.array([delay, fast.sum() * (slow * self.turn**2).sum()])
-        return spread / self._curvature**2 / (2 * snr * self.num_rx)
-
-    def pull(self, cells: float, rate: float, waveform: Waveform) -> np.ndarray:
-        """Variances (2,) of delay and delay rate by a wave of the path's own power and unknown
-        phase, whose beat is `cells` and whose delay rate is `rate` from it: the match takes the
-        rows of `LocalSpectra` alone."""
-        rows = np.arange(-HALF_WIDTH, HALF_WIDTH + 1)
-        step = 1e-3
-        here, other = hann_response(waveform, rows), hann_response(waveform, rows - cells)
-        slope = (hann_response(waveform, rows + step) - hann_response(waveform, rows - step)) / (
-            2 * step * waveform.delay_step
-        )
-        slow = self.slow * np.exp(1j * self.turn * rate)
-        powers = [
-            sum(abs(each[self.schedule == a].sum()) ** 2 for a in np.unique(self.schedule))
-            for each in (slow, self.turn * slow)
-        ]
-        delay = (slope @ other / (slope @ slope) / self.slow.sum()) ** 2
-        turned = (here @ other / (here @ here) / (self.slow * self.turn**2).sum()) ** 2
-        return np.array([delay * powers[0], turned * powers[1]]) / 2
+    delay = ((fast * ramp) ** 2).sum() / (fast * ramp**2).sum() ** 2 * (slow**2).sum() / size**2
+    rate = (fast**2).sum() / fast.sum() ** 2 * ((slow * turn) ** 2).sum() / curve**2
+    out = np.array([delay, rate]) / (snr * known.antennas.num_rx)
+    rows, step = np.arange(-HALF_WIDTH, HALF_WIDTH + 1), 1e-3
+    here = hann_response(w, rows)
+    slope = (hann_response(w, rows + step) - hann_response(w, rows - step)) / (2 * step)
+    slope /= w.delay_step
+    for power, cells, faster in waves:
+        other, wave = hann_response(w, rows - cells), slow * np.exp(1j * turn * faster)
+        late, quick = (sum(abs(x[m].sum()) ** 2 for m in each) for x in (wave, turn * wave))
+        delay = (slope @ other / (slope @ slope) / size) ** 2 * late
+        out += power * np.array([delay, (here @ other / (here @ here) / curve) ** 2 * quick])
+    return out / 2
 
 
 def round_of(
