@@ -28,6 +28,7 @@ FRAMES = 20
 _BUILT_IN = "munich", "florence", "etoile", "san_francisco", "simple_street_canyon_with_cars"
 CITIES = (*({"source": "builtin", "name": name} for name in _BUILT_IN), None)
 """Nodes `city`; None: the blocks of the base scene."""
+KINDS = "look", "report"
 FORMATIONS = ("facing", "beside", "square", "crossing", "abreast", "hovering")
 PT_TURN_DEG = {"facing": (160, 200), "beside": (10, 40), "square": (75, 105)}
 """Angle about the targets from the active to the first passive terminal; else any."""
@@ -38,11 +39,11 @@ targets; between targets in a row."""
 
 
 def write_drawn(folder: Path, count: int, seed: int) -> None:
-    """Write the draws that a folder lacks as `look_000.yaml`, `report_001.yaml` and so on."""
+    """Write the draws that a folder lacks: `look_000_facing_munich.yaml` and so on."""
     for number in range(count):
-        file = folder / f"{('look', 'report')[number % 2]}_{number:03}.yaml"
-        if not file.is_file():
-            write_whole(file, yaml.safe_dump(drawn(number, seed), sort_keys=False))
+        if not any(folder.glob(f"*_{number:03}_*.yaml")):
+            tree = drawn(number, seed)
+            write_whole(folder / f"{tree['name']}.yaml", yaml.safe_dump(tree, sort_keys=False))
 
 
 def drawn(number: int, seed: int) -> dict[str, Any]:
@@ -55,8 +56,9 @@ def drawn(number: int, seed: int) -> dict[str, Any]:
     pair, kind = divmod(number, 2)
     formation = FORMATIONS[(pair + pair // 6 + 3 * kind) % 6]
     tree = yaml.safe_load((SCENES / "blocks_swarm.yaml").read_text(encoding="utf-8"))
-    tree |= {"name": f"{formation}_{number:03}", "seed": seed + number, "frames": FRAMES}
     tree["city"] = CITIES[pair % 6] or tree["city"]
+    tree["name"] = f"{KINDS[kind]}_{number:03}_{formation}_{tree['city'].get('name', 'blocks')}"
+    tree |= {"seed": seed + number, "frames": FRAMES}
     tree["array"] = ARRAYS[(pair // 2 + pair // 6 + kind) % 3]
     city = city_of(Scenario.model_validate(tree))
     corners = city.corners + city.origin
