@@ -86,7 +86,7 @@ class Clutter(Node):
     max_error_db: Annotated[float, Field(gt=0, le=5, allow_inf_nan=False)] = 0.2
     """Error that nine of ten cells keep to, for `field` [dB]: of the mean clutter power in a 4 m
     range cell, and of noise plus clutter in a range-Doppler cell. A smaller error takes more
-    scatterers. The default is far below clutter's own fluctuation."""
+    scatterers than the default."""
     cell_area_per_metre_m: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
     """Largest area that one scatterer stands for, per metre of distance to the nearest terminal's
     flight [m^2/m], for `field`. null, the default: what `max_error_db` asks for."""
