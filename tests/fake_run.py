@@ -17,7 +17,14 @@ from isac_rt.results.losses import Loss
 from isac_rt.results.metrics import Gospa, SymbolCount
 from isac_rt.results.provenance import provenance
 from isac_rt.results.recorder import Figures, Recorder, Results
-from isac_rt.results.records import FrameRecord, ObserverRecord, TrackTable, UavValues
+from isac_rt.results.records import (
+    DetectionLabels,
+    FrameRecord,
+    ObserverRecord,
+    TrackTable,
+    UavScores,
+    UavValues,
+)
 from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.coverage import Coverage, coverage
@@ -142,6 +149,12 @@ def _reception(w, rng, truth, maps, decoded, detections):
     )
 
 
+def _labels(detections):
+    rows = np.array([[1, 2, 0, -1], [3, -1, 1, 70123], [-1, -1, -1, -1], [4, -1, 1, 5]])
+    kind, target, order, face = rows[:detections].T
+    return DetectionLabels(kind, target, order, face, np.zeros(detections, bool), target)
+
+
 def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord]:
     """Frames in which PT1 decodes all but the first, PT1 loses a tenth of the symbols of frame 3,
     and U1 is hidden in frame 4."""
@@ -168,17 +181,27 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
                     detections,
                 ),
                 paths=_paths(own, poses, "AT", name, rng),
-                truth=truth,
-                detected=_values(own, poses, 0.0637, see),
-                tracked=_values(own, poses, 0.0213, see),
-                bound=UavValues(
-                    **{
-                        name: np.where(see, 0.004 * (k + 1), np.nan)
-                        for k, name in enumerate(("range", "velocity", "azimuth", "elevation"))
-                    }
+                uavs=UavScores(
+                    truth=truth,
+                    detected=_values(own, poses, 0.0637, see),
+                    tracked=_values(own, poses, 0.0213, see),
+                    bound=UavValues(
+                        **{
+                            name: np.where(see, 0.004 * (k + 1), np.nan)
+                            for k, name in enumerate(("range", "velocity", "azimuth", "elevation"))
+                        }
+                    ),
+                    in_view=np.array([name == "PT1", False, True]),
+                    shadowed=hidden,
+                    hit=see & (f != 5),
+                    loss=np.where(see, Loss.INACCURATE if f == 5 else Loss.FOUND, -1),
+                    target_snr=np.where(see, 317.0, np.nan),
+                    target_clutter=np.where(see, 0.37, np.nan),
+                    cooperative=np.array([True, True, False]),
+                    genie=np.where(see, 0.97, np.nan),
+                    clutter_free=np.where(see, 0.83, np.nan),
                 ),
-                in_view=np.array([name == "PT1", False, True]),
-                shadowed=hidden,
+                labels=_labels(detections),
                 tracks=TrackTable(
                     id=np.array([4]),
                     range=truth.range[2:],
@@ -197,34 +220,12 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
                     false=np.array([not see[2]]),
                 ),
                 state=int(f > 0),
-                hit=see & (f != 5),
-                loss=np.where(see, Loss.INACCURATE if f == 5 else Loss.FOUND, -1),
-                target_snr=np.where(see, 317.0, np.nan),
-                target_clutter=np.where(see, 0.37, np.nan),
-                cooperative=np.array([True, True, False]),
-                genie=np.where(see, 0.97, np.nan),
-                clutter_free=np.where(see, 0.83, np.nan),
                 gospa=Gospa(0.3, 0.09, 0.0, 12.5 * (not see[2])),
-                detection_kind=np.array([1, 3, -1, 4][:detections])
-                if detections
-                else np.zeros(0, int),
-                detection_target=np.array([2, -1, -1, -1][:detections])
-                if detections
-                else np.zeros(0, int),
-                detection_order=np.array([0, 1, -1, 1][:detections])
-                if detections
-                else np.zeros(0, int),
-                detection_face=np.array([-1, 70123, -1, 5][:detections])
-                if detections
-                else np.zeros(0, int),
-                detection_sidelobe=np.zeros(detections, bool),
                 symbols=SymbolCount(
                     360, lost // 3, lost // 3, 351, lost, lost // 2, 4293, 2 * lost, 4293, 1
                 )
                 if sent
                 else SymbolCount(),
-                num_false=1,
-                num_clutter=1,
                 reference_snr=7.7,
             )
         out.append(

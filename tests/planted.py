@@ -792,7 +792,7 @@ OF_TESTS = (
         "test_interference::test_radars_that_do_not_receive_each_other_are_not",
         Bug(
             "simulation/preflight.py",
-            "sent = float(antennas.element_gain(tx.to_body(way / distance)))",
+            "sent = float(antennas.element_gain(tx.to_body(polyline / distance)))",
             "sent = antennas.gain",
         ),
     ),

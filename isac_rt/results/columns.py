@@ -62,12 +62,8 @@ def _number(meaning: str, source: str | Callable[[Any], Any], dtype: type, **mor
     return Column(dtype, DIMENSIONLESS, meaning, source, **more)
 
 
-def _of_uavs(meaning: str, source: str) -> Column:
-    return _number(meaning, source, float, dims=("uav",), missing=np.nan)
-
-
-def _found_sparse(o: ObserverRecord) -> int:
-    return -1 if o.reception.sparse is None else int(o.reception.sparse)
+def _of_uavs(meaning: str, name: str, dtype: type = float, missing: float = np.nan) -> Column:
+    return _number(meaning, f"uavs.{name}", dtype, dims=("uav",), missing=missing)
 
 
 def _path_counts(o: ObserverRecord) -> np.ndarray:
@@ -103,41 +99,23 @@ FRAMES: dict[str, Column] = {
 OBSERVERS: dict[str, Column] = {
     **{
         f"{group}_{name}": Column(
-            float,
-            units,
-            f"{word} {name} of the UAV, seen by the observer",
-            f"{group}.{name}",
-            ("uav",),
-            np.nan,
+            float, units, meaning.format(name), f"uavs.{group}.{name}", ("uav",), np.nan
         )
-        for group, word in (("truth", "true"), ("detected", "detected"), ("tracked", "tracked"))
-        for name, (units, _) in MEASURES.items()
-    },
-    **{
-        f"bound_{name}": Column(
-            float,
-            units,
-            f"least standard deviation of an estimate of the {name} in noise (Cramer-Rao)",
-            f"bound.{name}",
-            ("uav",),
-            np.nan,
+        for group, meaning in (
+            ("truth", "true {} of the UAV, seen by the observer"),
+            ("detected", "detected {} of the UAV, seen by the observer"),
+            ("tracked", "tracked {} of the UAV, seen by the observer"),
+            ("bound", "least standard deviation of an estimate of the {} in noise (Cramer-Rao)"),
         )
         for name, (units, _) in MEASURES.items()
     },
-    "in_view": _number("UAV inside the field of view", "in_view", bool, dims=("uav",)),
-    "shadowed": _number("UAV occluded by the city", "shadowed", bool, dims=("uav",)),
-    "hit": _number(
-        "UAV found by its own path within one resolution on all four axes",
-        "hit",
-        bool,
-        dims=("uav",),
+    "in_view": _of_uavs("UAV inside the field of view", "in_view", bool, 0),
+    "shadowed": _of_uavs("UAV occluded by the city", "shadowed", bool, 0),
+    "hit": _of_uavs(
+        "UAV found by its own path within one resolution on all four axes", "hit", bool, 0
     ),
-    "loss": _number(
-        "what became of a UAV in view and unshadowed, -1: not one",
-        "loss",
-        np.int8,
-        dims=("uav",),
-        missing=-1,
+    "loss": _of_uavs(
+        "what became of a UAV in view and unshadowed, -1: not one", "loss", np.int8, -1
     ),
     "target_snr": _of_uavs(
         "SNR of the UAV's own path behind a matched filter over samples, chirps and antennas",
@@ -147,8 +125,8 @@ OBSERVERS: dict[str, Column] = {
         "power of the diffuse paths in the UAV's cell over the noise of one channel's map",
         "target_clutter",
     ),
-    "cooperative": _number(
-        "UAV that is a terminal and reports its position", "cooperative", bool, dims=("uav",)
+    "cooperative": _of_uavs(
+        "UAV that is a terminal and reports its position", "cooperative", bool, 0
     ),
     "genie": _of_uavs(
         "probability that a matched filter at the true parameters finds the UAV's own path", "genie"
@@ -187,7 +165,7 @@ OBSERVERS: dict[str, Column] = {
     ),
     "sparse": _number(
         "the receiver found the scene sparse: 1, not: 0, not judged: -1",
-        _found_sparse,
+        lambda o: -1 if o.reception.sparse is None else o.reception.sparse,
         np.int8,
         missing=-1,
     ),
@@ -204,9 +182,13 @@ OBSERVERS: dict[str, Column] = {
         float,
         missing=np.nan,
     ),
-    "num_false": _number("detections that no path explains", "num_false", np.int32),
+    "num_false": _number(
+        "detections that no path explains", lambda o: (o.labels.kind < 0).sum(), np.int32
+    ),
     "num_clutter": _number(
-        "detections that something other than a UAV's own path explains", "num_clutter", np.int32
+        "detections that something other than a UAV's own path explains",
+        lambda o: ((o.labels.kind >= 0) & (o.labels.uav < 0)).sum(),
+        np.int32,
     ),
     "slips": _number("symbols decided outside their alphabet", "slips", np.int32),
     "path_count": _number("number of paths", _path_counts, np.int32, dims=("kind",)),
@@ -276,20 +258,20 @@ DETECTIONS: dict[str, Column] = {
         )
     },
     "is_reference": _number("line of sight at a PT", _of_detections("is_reference"), bool),
-    "kind": _number("kind of the path that explains it, -1: none", "detection_kind", np.int8),
-    "target": _number("index of the UAV that explains it, -1: none", "detection_target", np.int16),
+    "kind": _number("kind of the path that explains it, -1: none", "labels.kind", np.int8),
+    "target": _number("index of the UAV that explains it, -1: none", "labels.target", np.int16),
     "order": _number(
         "interactions with the city of the path that explains it, 0: direct, -1: no path",
-        "detection_order",
+        "labels.order",
         np.int16,
     ),
     "face": _number(
         "first face of the city's mesh on the path that explains it, -1: none",
-        "detection_face",
+        "labels.face",
         np.int32,
     ),
     "skirt": _number(
-        "the path that explains it lies more than a cell away", "detection_sidelobe", bool
+        "the path that explains it lies more than a cell away", "labels.sidelobe", bool
     ),
 }
 TRACKS: dict[str, Column] = {

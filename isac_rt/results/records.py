@@ -64,23 +64,18 @@ class TrackTable:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObserverRecord:
-    """Inputs and outputs of one link's receiving terminal in one frame.
+class UavScores:
+    """Scores of a frame at an observer by UAV of the scenario, in its order.
 
     Attributes
     ----------
-    transmitter : whose chirps it received
-    reception : what it found
-    paths : what it received
     truth, detected, tracked : over all UAVs; estimates are NaN where none is associated
-    bound : least standard deviations of an estimate of each UAV (Cramer-Rao), NaN where it is not
-        in view or shadowed
-    in_view, shadowed : (U,) bool; whether a UAV is in the field of view; whether the city hides it
-    tracks : after this frame
-    state : code of the terminal's state, an index into the recorder's `states`
-    hit : (U,) bool; whether a UAV in view and unshadowed was found by its own path, within one
+    bound : least standard deviations of an estimate (Cramer-Rao), NaN where the UAV is not in view
+        or shadowed
+    in_view, shadowed : (U,) bool; whether it is in the field of view; whether the city hides it
+    hit : (U,) bool; whether it is in view, unshadowed and found by its own path, within one
         resolution on all four axes
-    loss : (U,) `isac_rt.results.losses.Loss` of every UAV in view and unshadowed, -1 of the others
+    loss : (U,) `isac_rt.results.losses.Loss` where it is in view and unshadowed, else -1
     target_snr : (U,) SNR of its own path behind a matched filter that is coherent over the whole
         frame (linear), NaN where it is not in view or shadowed
     target_clutter : (U,) power of the clutter in its cell over the noise (linear), likewise
@@ -90,32 +85,14 @@ class ObserverRecord:
         where it is not in view or shadowed
     clutter_free : (U,) probability that the receiver's detector would find it in noise alone,
         likewise
-    gospa : of the confirmed tracks against the targets in view and unshadowed
-    detection_kind, detection_target, detection_order, detection_face, detection_sidelobe : (Q,)
-        what explains each detection, as `isac_rt.results.labels.Explanation` says, targets as
-        indices of UAVs
-    symbols : what was sent to it and became of it
-    latency : frames after which its data were read, -1: they were not
-    fell_back : whether the transmitter sent the conventional schedule in place of the scenario's
-        (`isac_rt.simulation.fall_back`)
-    num_false, num_clutter : detections that no path explains, and those that something other than a
-        UAV's own path explains
-    slips : symbols decided outside their alphabet
-    reference_snr : per sample and antenna before processing (linear); NaN where there is no
-        reference path
     """
 
-    transmitter: str
-    reception: Reception
-    paths: PathSet
     truth: UavValues
     detected: UavValues
     tracked: UavValues
     bound: UavValues
     in_view: np.ndarray
     shadowed: np.ndarray
-    tracks: TrackTable
-    state: int
     hit: np.ndarray
     loss: np.ndarray
     target_snr: np.ndarray
@@ -123,18 +100,56 @@ class ObserverRecord:
     cooperative: np.ndarray
     genie: np.ndarray
     clutter_free: np.ndarray
+
+
+@dataclass(frozen=True)
+class DetectionLabels:
+    """Explanations of Q detections (`isac_rt.results.labels.Explanation`), targets as indices of
+    UAVs, and the UAV whose own path explains each (`uav`, -1: none's)."""
+
+    kind: np.ndarray
+    target: np.ndarray
+    order: np.ndarray
+    face: np.ndarray
+    sidelobe: np.ndarray
+    uav: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObserverRecord:
+    """Inputs and outputs of one link's receiving terminal in one frame.
+
+    Attributes
+    ----------
+    transmitter : whose chirps it received
+    paths : what it received
+    reception : what it found
+    labels : of its detections
+    uavs : what it found of each UAV
+    tracks : after this frame
+    state : code of the terminal's state, an index into the recorder's `states`
+    gospa : of the confirmed tracks against the targets in view and unshadowed
+    symbols : what was sent to it and became of it
+    latency : frames after which its data were read, -1: they were not
+    slips : symbols decided outside their alphabet
+    fell_back : whether the transmitter sent the conventional schedule in place of the scenario's
+        (`isac_rt.simulation.fall_back`)
+    reference_snr : per sample and antenna before processing (linear); NaN where there is no
+        reference path
+    """
+
+    transmitter: str
+    paths: PathSet
+    reception: Reception
+    labels: DetectionLabels
+    uavs: UavScores
+    tracks: TrackTable
+    state: int
     gospa: Gospa
-    detection_kind: np.ndarray
-    detection_target: np.ndarray
-    detection_order: np.ndarray
-    detection_face: np.ndarray
-    detection_sidelobe: np.ndarray
     symbols: SymbolCount = field(default_factory=SymbolCount)
     latency: int = -1
-    fell_back: bool = False
-    num_false: int = 0
-    num_clutter: int = 0
     slips: int = 0
+    fell_back: bool = False
     reference_snr: float = np.nan
 
 

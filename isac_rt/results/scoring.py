@@ -32,7 +32,14 @@ from isac_rt.results.metrics import (
     truth_of,
     within_view,
 )
-from isac_rt.results.records import LateRecord, ObserverRecord, TrackTable, UavValues
+from isac_rt.results.records import (
+    DetectionLabels,
+    LateRecord,
+    ObserverRecord,
+    TrackTable,
+    UavScores,
+    UavValues,
+)
 from isac_rt.track.parts import Late
 from isac_rt.track.tracker import TrackSet
 from isac_rt.world.swarm import Swarm
@@ -102,9 +109,8 @@ class Scorer(Stateful):
         view = self._view(frame, paths)
         sees = self._sensitivity(frame, sent, noise_power)
         labels = self._labels_of(reception.detections, paths, sees, view.directions)
-        best, hit = self._found(view, reception.detections, labels.uav)
         reported = self._reported(frame)
-        seen = np.isin(np.arange(len(hit)), list(view.seen))
+        seen = np.isin(np.arange(len(view.truth)), list(view.seen))
         confirmed = tracks.mean[tracks.confirmed, :3]
         distance, false = score_tracks(confirmed, view.positions, seen & ~reported)
         table, caused = self._table(view, tracks, labels, false)
@@ -114,44 +120,56 @@ class Scorer(Stateful):
         read = symbols.delay_errors <= MISREAD * symbols.delay_total
         read &= symbols.frames == 0 or reception.placed
         chances = self._chances(view, paths, sees)
-        loss = np.full(len(hit), -1, np.int8)
-        for i, chance in chances.items():
-            beside = labels.kind[self._beside(view.seen[i], reception.detections)]
-            own = bool((labels.uav == i).any())
-            loss[i] = cause_of(bool(hit[i]), own, beside, chance, sees, read)
         raw = reception.raw_delay_symbols
         return ObserverRecord(
             transmitter=self.link.tx,
-            reception=reception,
             paths=paths,
-            truth=_values([None if t is None else np.array(t)[[0, 1, 4, 5]] for t in view.truth]),
-            detected=_estimates(
-                len(hit), reception.detections.measured, best, self._resolution.observed
-            ),
-            tracked=_estimates(len(hit), tracks.measured, caused, self._resolution.observed),
-            in_view=view.inside,
-            shadowed=view.inside & ~view.direct,
+            reception=reception,
+            labels=labels,
+            uavs=self._uavs(view, received, labels, caused, reported, chances, sees, read),
             tracks=table,
             state=received.state,
-            hit=hit,
-            loss=loss,
-            bound=self._bound(view, chances),
-            target_snr=_by_uav({i: c.matched for i, c in chances.items()}, len(hit)),
-            target_clutter=_by_uav({i: c.clutter for i, c in chances.items()}, len(hit)),
-            cooperative=reported,
-            genie=_by_uav({i: sees.genie(c.matched) for i, c in chances.items()}, len(hit)),
-            clutter_free=_by_uav(
-                {i: sees.clutter_free(c.cell) for i, c in chances.items()}, len(hit)
-            ),
             gospa=distance,
-            **{f"detection_{name}": value for name, value in vars(labels).items() if name != "uav"},
             symbols=symbols,
             latency=0 if reception.decoded else -1,
-            fell_back=sent.schedule is not timetable.schedule,
-            num_false=int((labels.kind < 0).sum()),
-            num_clutter=int(((labels.kind >= 0) & (labels.uav < 0)).sum()),
             slips=int(((raw < 0) | (raw >= timetable.waveform.num_delay_symbols)).sum()),
+            fell_back=sent.schedule is not timetable.schedule,
             reference_snr=_reference_snr(paths, sent.amplitude, noise_power),
+        )
+
+    def _uavs(
+        self,
+        view: _View,
+        received: LinkResult,
+        labels: DetectionLabels,
+        caused: dict[int, int],
+        reported: np.ndarray,
+        chances: dict[int, Chance],
+        sees: Sensitivity,
+        read: bool,
+    ) -> UavScores:
+        """Return what the frame shows of each UAV; `caused`: the track that its path feeds."""
+        d, count, observed = received.reception.detections, len(reported), self._resolution.observed
+        best, hit = self._found(view, d, labels.uav)
+        loss = np.full(count, -1, np.int8)
+        for i, chance in chances.items():
+            beside = labels.kind[self._beside(view.seen[i], d)]
+            own = bool((labels.uav == i).any())
+            loss[i] = cause_of(bool(hit[i]), own, beside, chance, sees, read)
+        return UavScores(
+            truth=_values([None if t is None else np.array(t)[[0, 1, 4, 5]] for t in view.truth]),
+            detected=_estimates(count, d.measured, best, observed),
+            tracked=_estimates(count, received.tracks.measured, caused, observed),
+            bound=self._bound(view, chances),
+            in_view=view.inside,
+            shadowed=view.inside & ~view.direct,
+            hit=hit,
+            loss=loss,
+            target_snr=_by_uav({i: c.matched for i, c in chances.items()}, count),
+            target_clutter=_by_uav({i: c.clutter for i, c in chances.items()}, count),
+            cooperative=reported,
+            genie=_by_uav({i: sees.genie(c.matched) for i, c in chances.items()}, count),
+            clutter_free=_by_uav({i: sees.clutter_free(c.cell) for i, c in chances.items()}, count),
         )
 
     def late(self, frame: int, received: LinkResult) -> list[LateRecord]:
@@ -212,14 +230,14 @@ class Scorer(Stateful):
 
     def _labels_of(
         self, d: Detections, paths: PathSet, sees: Sensitivity, directions: np.ndarray
-    ) -> _Labels:
+    ) -> DetectionLabels:
         beam = np.where(self._resolution.observed, self._resolution.width[2:], np.inf)
         aim = Aim(directions, beam)
         found = explain(d, paths, self._timetable.waveform, self._passes, sees.cell, aim)
         names = list(self._swarm.uavs)
         uav = owners(found.kind, found.target, paths, names)
         index = np.array([names.index(name) for name in paths.target_names] + [-1], np.int16)
-        return _Labels(
+        return DetectionLabels(
             **found._replace(target=index[found.target])._asdict(),
             uav=np.where(found.sidelobe, -1, uav),
         )
@@ -238,7 +256,7 @@ class Scorer(Stateful):
         return best, hit
 
     def _table(
-        self, view: _View, tracks: TrackSet, labels: _Labels, false: np.ndarray
+        self, view: _View, tracks: TrackSet, labels: DetectionLabels, false: np.ndarray
     ) -> tuple[TrackTable, dict[int, int]]:
         """Return the tracks with what explains them and whom they follow, and the rows of those
         that follow the UAV whose own path explains their latest detection.
@@ -334,18 +352,6 @@ class _View:
     seen: dict[int, Truth]
     positions: np.ndarray
     directions: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Labels:
-    """An `Explanation` by indices of UAVs, and whose own path each is (`uav`, -1: none's)."""
-
-    kind: np.ndarray
-    target: np.ndarray
-    order: np.ndarray
-    face: np.ndarray
-    sidelobe: np.ndarray
-    uav: np.ndarray
 
 
 def _by_uav(values: dict[int, float], count: int) -> np.ndarray:

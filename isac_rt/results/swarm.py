@@ -115,7 +115,8 @@ class SwarmScorer(Stateful):
         """
         timetable, state = self._timetable, self.state
         for link, o in observers.items():
-            state.seen[link], state.found[link] = o.in_view & ~o.shadowed, o.hit
+            u = o.uavs
+            state.seen[link], state.found[link] = u.in_view & ~u.shadowed, u.hit
         now = [link for link in state.seen if timetable.holds(link, frame)]
         target = np.array([role == "target" for role in timetable.roles(frame).values()])
         seen = {link: state.seen[link] & target for link in now}

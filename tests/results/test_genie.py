@@ -84,7 +84,7 @@ def test_the_matched_filter_of_losses_is_one():
         observer = Station(setup, link, terminal, scenario.receivers)
         record = observer.record(frame, observer.receive(frame, frame.received(link), False))
         paths = frame.paths[link]
-        for i in np.flatnonzero(np.isfinite(record.target_snr)):
+        for i in np.flatnonzero(np.isfinite(record.uavs.target_snr)):
             name = list(setup.swarm.uavs)[i]
             if name == link.tx:
                 continue  # its line of sight
@@ -93,8 +93,10 @@ def test_the_matched_filter_of_losses_is_one():
             body, here = np.concatenate([pose.position, pose.velocity]), flights[link.rx].pose(when)
             amplitude = abs(paths.gain[own].item()) * frame.sent["AT"].amplitude
             snr = matched_snr(setup.waveform, frame.sent["AT"], here, body) * amplitude**2 / watts
-            assert 10 * np.log10(record.target_snr[i] / snr) == pytest.approx(0, abs=TOLERANCE_DB)
-            finds = stats.ncx2.sf(threshold, 2, 2 * record.target_snr[i])
-            assert record.genie[i] == pytest.approx(finds, rel=1e-6)
+            assert 10 * np.log10(record.uavs.target_snr[i] / snr) == pytest.approx(
+                0, abs=TOLERANCE_DB
+            )
+            finds = stats.ncx2.sf(threshold, 2, 2 * record.uavs.target_snr[i])
+            assert record.uavs.genie[i] == pytest.approx(finds, rel=1e-6)
             compared += 1
     assert compared == 8

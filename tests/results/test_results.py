@@ -108,8 +108,10 @@ def test_what_was_recorded_is_found_by_name(run):
     d, records = run.dataset, fake_records(run.scenario)
     o = records[4].observers["PT1"]
     here = {"observer": list(d.observer.values).index("PT1"), "frame": 4}
-    assert np.array_equal(d.truth_range.isel(here).values, o.truth.range)
-    assert np.array_equal(d.tracked_azimuth.isel(here).values, o.tracked.azimuth, equal_nan=True)
+    assert np.array_equal(d.truth_range.isel(here).values, o.uavs.truth.range)
+    assert np.array_equal(
+        d.tracked_azimuth.isel(here).values, o.uavs.tracked.azimuth, equal_nan=True
+    )
     assert np.isnan(d.truth_range.isel(frame=3, observer=0)).all() and not d.processed.values[3, 0]
     assert np.array_equal(
         d.uav_position.sel(uav="U1").values, [r.poses["U1"].position for r in records]

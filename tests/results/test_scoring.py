@@ -15,6 +15,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, waveform_of
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections, Reception
+from isac_rt.results.columns import OBSERVERS
 from isac_rt.results.losses import Loss
 from isac_rt.results.scoring import LinkResult, Scorer
 from isac_rt.scenario.swarm import Uav
@@ -204,16 +205,16 @@ def test_what_became_of_a_uav_at_the_active_terminal(name):
     own = [path_of("AT", "U1", DATA, gain)]
     own += [path_of("AT", "U1", DATA, g, kind, off) for g, kind, off in others]
     record = scored(scorer("AT"), DATA, own, [point("AT", "U1", DATA, off) for off in points])
-    assert Loss(record.loss[0]) is expected
-    assert record.loss.tolist() == [expected, -1, -1, -1]
-    assert record.hit.tolist() == [expected is Loss.FOUND, False, False, False]
-    assert record.target_snr[0] == pytest.approx(MATCHED * gain**2)
-    assert np.isnan(record.target_snr[1:]).all()
-    assert (record.target_clutter[0] > 1) == (others is WALL)
+    assert Loss(record.uavs.loss[0]) is expected
+    assert record.uavs.loss.tolist() == [expected, -1, -1, -1]
+    assert record.uavs.hit.tolist() == [expected is Loss.FOUND, False, False, False]
+    assert record.uavs.target_snr[0] == pytest.approx(MATCHED * gain**2)
+    assert np.isnan(record.uavs.target_snr[1:]).all()
+    assert (record.uavs.target_clutter[0] > 1) == (others is WALL)
     # errors are of detections by the own path within three resolutions
     seen = expected is Loss.FOUND or name == "its detection has no direction"
     seen |= name == "its detection points elsewhere"
-    assert np.isfinite(record.detected.range[0]) == seen
+    assert np.isfinite(record.uavs.detected.range[0]) == seen
 
 
 @pytest.mark.parametrize(
@@ -234,14 +235,14 @@ def test_what_became_of_the_transmitter_at_a_passive_one(points, reception, expe
     sight = [path_of("PT1", "AT", DATA, 3.0)]
     found = [point("PT1", "AT", DATA, off) for off in points]
     record = scored(scorer("PT1"), DATA, sight, found, **reception)
-    assert record.loss.tolist() == [-1, expected, -1, -1]
-    assert record.hit.tolist() == [False, expected is Loss.FOUND, False, False]
+    assert record.uavs.loss.tolist() == [-1, expected, -1, -1]
+    assert record.uavs.hit.tolist() == [False, expected is Loss.FOUND, False, False]
 
 
 def test_a_pilot_needs_no_reading():
     record = scored(scorer("PT1"), 0, [path_of("PT1", "AT", 0, 3.0)])
     assert not TIMETABLE.modulated(0)
-    assert record.loss[1] == Loss.OTHER
+    assert record.uavs.loss[1] == Loss.OTHER
 
 
 def test_two_uavs_are_told_apart_by_their_paths():
@@ -253,19 +254,19 @@ def test_two_uavs_are_told_apart_by_their_paths():
     points = [point("PT1", "U1", DATA), point("PT1", "U2", DATA, (12.1, 9.1, 0.0, 0.0))]
     points += [seen_by("PT1", "U1", DATA) + np.array([40.0, 7.0, 0, 0])]
     record = scored(scorer("PT1"), DATA, [*rows, ghost], points, **read(DATA))
-    assert record.hit.tolist() == [True, False, False, False]
-    assert record.loss.tolist()[::2] == [Loss.FOUND, -1]
-    assert record.detection_kind.tolist() == [PathKind.TARGET, PathKind.GHOST, -1]
-    assert record.detection_target.tolist() == [0, 3, -1]
-    assert (record.num_false, record.num_clutter) == (1, 1)
+    assert record.uavs.hit.tolist() == [True, False, False, False]
+    assert record.uavs.loss.tolist()[::2] == [Loss.FOUND, -1]
+    assert record.labels.kind.tolist() == [PathKind.TARGET, PathKind.GHOST, -1]
+    assert record.labels.target.tolist() == [0, 3, -1]
+    assert [OBSERVERS[name].read(record) for name in ("num_false", "num_clutter")] == [1, 1]
 
 
 def test_shadowed_or_behind_is_not_in_view():
     """U1 without a path is in view and shadowed; PT1, behind nobody, has none at the AT either."""
     record = scored(scorer("AT"), DATA, [path_of("AT", "U2", DATA, 3.0)])
-    assert record.in_view.tolist() == [True, False, True, True]
-    assert record.shadowed.tolist() == [True, False, True, False]
-    assert record.loss.tolist() == [-1, -1, -1, Loss.OTHER]
+    assert record.uavs.in_view.tolist() == [True, False, True, True]
+    assert record.uavs.shadowed.tolist() == [True, False, True, False]
+    assert record.uavs.loss.tolist() == [-1, -1, -1, Loss.OTHER]
 
 
 def test_a_uav_is_tracked_by_place_and_errors_are_of_its_own_path():
@@ -286,7 +287,7 @@ def test_a_uav_is_tracked_by_place_and_errors_are_of_its_own_path():
         tracks += [(4, True, fed[0], "U1", 0.1), (9, True, fed[1], "U1", 0.9)]
         record = scored(judge, frame, rows, points, tracks)
         assert not record.tracks.false.any()
-        return record.tracks, bool(np.isfinite(record.tracked.range[0]))
+        return record.tracks, bool(np.isfinite(record.uavs.tracked.range[0]))
 
     first, known = step(DATA, (1, 0), ["echo", "wall"])
     assert (first.uav.tolist(), known) == ([-1, 0, -1], False)
@@ -327,15 +328,15 @@ def test_targets_are_scored_without_the_terminals():
     names = zip((4, 5, 6), ("U1", "PT1", "U2"), (0.3, 2.0, 0.0), strict=True)
     tracks = [(number, True, -1, name, east) for number, name, east in names]
     record = scored(scorer("AT"), DATA, rows, [], tracks)
-    assert record.cooperative.tolist() == [False, True, True, False]
+    assert record.uavs.cooperative.tolist() == [False, True, True, False]
     assert record.gospa[1:] == pytest.approx((0.09, 0.0, 0.0))
-    assert (record.genie[[0, 2]] > 0.99).all() and np.isnan(record.genie[[1, 3]]).all()
-    assert (record.clutter_free[[0, 2]] > 0.99).all()
+    assert (record.uavs.genie[[0, 2]] > 0.99).all() and np.isnan(record.uavs.genie[[1, 3]]).all()
+    assert (record.uavs.clutter_free[[0, 2]] > 0.99).all()
     roles = TIMETABLE.first_roles
     alone = replace(TIMETABLE, first_roles=roles | {"U1": "passive", "U2": "passive"})
     judge = Scorer(Link("AT", "AT"), ANTENNAS, SWARM, alone, Receivers())
     record = scored(judge, DATA, rows, [], tracks)
-    assert not record.cooperative.any()
+    assert not record.uavs.cooperative.any()
     assert record.gospa[1:] == pytest.approx((4.09, 0.0, 0.0))
 
 
@@ -344,9 +345,9 @@ def test_an_alias_or_a_drifted_track_does_not_stand_for_a_uav():
     track that went astray. Planted bug: no gate."""
     far = point("AT", "U1", DATA) + np.array([0, 2 * W.max_velocity(2), 0, 0])
     record = scored(scorer("AT"), DATA, [path_of("AT", "U1", DATA, 30.0)], [far])
-    assert record.detection_kind.tolist() == [PathKind.TARGET]
-    assert np.isnan(record.detected.range).all()
-    assert record.loss[0] == Loss.INACCURATE
+    assert record.labels.kind.tolist() == [PathKind.TARGET]
+    assert np.isnan(record.uavs.detected.range).all()
+    assert record.uavs.loss[0] == Loss.INACCURATE
     test_cells = scorer("AT")
     tracks = [(1, True, 0, "U2", 0.0)]
     rows = [path_of("AT", "U1", DATA, 30.0)]
@@ -364,8 +365,8 @@ def test_of_two_tracks_the_one_that_followed_goes_on():
     tracks = [(3, True, 0, "U1", 0.0), (7, True, 1, "U1", 0.0)]
     record = scored(test_cells, DATA + 1, rows[DATA + 1], found[DATA + 1], tracks)
     assert record.tracks.uav.tolist() == [-1, 0]
-    assert record.tracked.range[0] == record.tracks.range[1]
-    assert np.isnan(record.tracked.range[1:]).all()
+    assert record.uavs.tracked.range[0] == record.tracks.range[1]
+    assert np.isnan(record.uavs.tracked.range[1:]).all()
     again = scorer("AT")
     scored(again, DATA, rows[DATA], found[DATA], [(7, True, 0, "U1", 0.0)])
     resumed = scorer("AT")
@@ -380,9 +381,9 @@ def test_a_neighbour_uav_is_not_the_uav():
     other = path_of("AT", "U1", DATA, 60.0, PathKind.TARGET, (1.6, 0.0)) | {"target": 3}
     rows = [path_of("AT", "U1", DATA, 3.0), other]
     record = scored(scorer("AT"), DATA, rows, [point("AT", "U1", DATA, (1.6, 0, 0, 0))])
-    assert record.detection_target.tolist() == [3]
-    assert np.isnan(record.detected.range[0])
-    assert record.loss[0] == Loss.MASKED
+    assert record.labels.target.tolist() == [3]
+    assert np.isnan(record.uavs.detected.range[0])
+    assert record.uavs.loss[0] == Loss.MASKED
 
 
 def test_what_is_outside_the_view_or_bent_is_not_asked_for():
@@ -392,7 +393,11 @@ def test_what_is_outside_the_view_or_bent_is_not_asked_for():
     narrow = replace(ANTENNAS, half_view=0.05)
     test_cells = Scorer(Link("AT", "AT"), narrow, SWARM, TIMETABLE, Receivers())
     record = scored(test_cells, DATA, rows)
-    assert (record.in_view[0], record.shadowed[0], record.loss[0]) == (False, False, -1)
+    assert (record.uavs.in_view[0], record.uavs.shadowed[0], record.uavs.loss[0]) == (
+        False,
+        False,
+        -1,
+    )
     pose = SWARM.poses(TIMETABLE.epoch(DATA))["AT"]
     sent = Transmission(
         name="AT",
@@ -404,14 +409,18 @@ def test_what_is_outside_the_view_or_bent_is_not_asked_for():
     heard = LinkResult(Reception.undecoded(W, detections([])), track_set("AT", DATA, []), 1)
     bent = pathset("AT", rows, np.ones((1, 2, 3)))
     record = scorer("AT").record(DATA, bent, sent, heard, NOISE)
-    assert (record.in_view[0], record.shadowed[0], record.loss[0]) == (True, True, -1)
+    assert (record.uavs.in_view[0], record.uavs.shadowed[0], record.uavs.loss[0]) == (
+        True,
+        True,
+        -1,
+    )
 
 
 def test_the_strongest_of_its_paths_is_asked():
     """A path in two pieces of which one is weak."""
     rows = [path_of("AT", "U1", DATA, 0.1), path_of("AT", "U1", DATA, 3.0)]
     record = scored(scorer("AT"), DATA, rows)
-    assert record.target_snr[0] == pytest.approx(9 * MATCHED)
+    assert record.uavs.target_snr[0] == pytest.approx(9 * MATCHED)
 
 
 def test_streams_and_blocks():
@@ -426,9 +435,9 @@ def test_streams_and_blocks():
     test_cells = Scorer(Link("AT", "PT1"), ANTENNAS, SWARM, table, Receivers())
     sight = {f: [path_of("PT1", "AT", f, 3.0)] for f in (0, DATA)}
     found = {f: scored(test_cells, f, paths) for f, paths in sight.items()}
-    assert found[0].target_snr[1] == pytest.approx(9 * MATCHED)
-    assert found[DATA].target_snr[1] == pytest.approx(3 * MATCHED)
+    assert found[0].uavs.target_snr[1] == pytest.approx(9 * MATCHED)
+    assert found[DATA].uavs.target_snr[1] == pytest.approx(3 * MATCHED)
     later = SWARM.poses(TIMETABLE.epoch(DATA) + 3 * 2 * W.max_delay)
     length = np.linalg.norm(later["AT"].position - later["PT1"].position)
     # rounding: 45 m in float64; a block later it is 2e-5 m shorter
-    assert found[DATA].truth.range[1] == pytest.approx(length, abs=1e-9)
+    assert found[DATA].uavs.truth.range[1] == pytest.approx(length, abs=1e-9)

@@ -50,7 +50,11 @@ def observers(hits=()):
     hit = np.isin([*PLACES], hits)
     return {
         link: SimpleNamespace(
-            in_view=np.array(seen, bool), shadowed=np.zeros(5, bool), hit=hit & np.array(seen, bool)
+            uavs=SimpleNamespace(
+                in_view=np.array(seen, bool),
+                shadowed=np.zeros(5, bool),
+                hit=hit & np.array(seen, bool),
+            )
         )
         for link, seen in SEEN.items()
     }
