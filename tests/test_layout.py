@@ -244,7 +244,7 @@ MAX_LINES = {
     "receive": 6100,
     "track": 1850,
     "scenario": 1630,
-    "results": 3450,
+    "results": 3580,
     "simulation": 3400,
     "sweep": 2350,
     "views": 3040,

@@ -121,6 +121,16 @@ OBSERVERS: dict[str, Column] = {
         "SNR of the UAV's own path behind a matched filter over samples, chirps and antennas",
         "target_snr",
     ),
+    "target_cell_snr": _of_uavs(
+        "SNR of that path in its cell of the Hann-windowed map, all channels in phase",
+        "target_cell_snr",
+    ),
+    "target_straddling": _of_uavs(
+        "share of that SNR which is left of it because it lies between cells", "target_straddling"
+    ),
+    "target_whitened_snr": _of_uavs(
+        "SNR of that path in its cell, channels whitened by the true clutter", "target_whitened_snr"
+    ),
     "target_clutter": _of_uavs(
         "power of the diffuse paths in the UAV's cell over the noise of one channel's map",
         "target_clutter",
@@ -133,6 +143,9 @@ OBSERVERS: dict[str, Column] = {
     ),
     "clutter_free": _of_uavs(
         "probability that the receiver's detector would find the UAV in noise alone", "clutter_free"
+    ),
+    "whitened": _of_uavs(
+        "probability that a detector whitened by the true clutter finds the UAV", "whitened"
     ),
     **{
         f"gospa_{part}": Column(

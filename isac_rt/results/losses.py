@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chndtr
@@ -17,6 +18,7 @@ from isac_rt.receive.cfar import STRONG, CfarRule, hann_envelope
 from isac_rt.receive.maps import UNION_FLOOR
 from isac_rt.receive.settings import Receivers
 from isac_rt.results.labels import Places, hann_response
+from isac_rt.world.swarm import Pose
 
 MATCHED_DB = 13.0
 """SNR under which a coherent matched filter is taken to see nothing: with 13.1 dB it finds a steady
@@ -29,6 +31,8 @@ SIDELOBE_MARGIN = 4.0
 (`cfar.without_sidelobes`)."""
 HANN_LOSS = 1.5
 """Noise bandwidth of a Hann window in cells."""
+MAIN_LOBE = 2
+"""Half width of a Hann window's main lobe in cells."""
 
 
 class Loss(IntEnum):
@@ -111,6 +115,11 @@ class Sensitivity:
             return self.detection_probability(snr)
         return single_look(snr * self.rule.looks, self.beam_rate)
 
+    def whitened(self, snr: float) -> float:
+        """Probability that one test of the whitened channels of a cell finds a steady path, from
+        its SNR there."""
+        return single_look(snr, self.rule.rate if self.beam_rate is None else self.beam_rate)
+
     def genie(self, snr: float) -> float:
         """Probability that a matched filter at a path's true delay, Doppler and direction finds it,
         from its coherent SNR; its false alarms are those of a cell."""
@@ -123,6 +132,22 @@ def single_look(snr: float, rate: float) -> float:
     return float(1 - chndtr(-2 * np.log(rate), 2, 2 * snr))
 
 
+class Channels(NamedTuple):
+    """Channels of a link: arrays, wavenumber [1/m], and poses of transmitter and receiver."""
+
+    antennas: Antennas
+    wavenumber: float
+    tx: Pose
+    rx: Pose
+
+    def steering(self, paths: PathSet, rows: np.ndarray) -> np.ndarray:
+        """(n, L) phases of some paths over the channels, as plane waves."""
+        tx = self.tx.to_body(paths.departure[rows]) @ self.antennas.tx_positions.T
+        rx = self.rx.to_body(paths.arrival[rows]) @ self.antennas.rx_positions.T
+        length = (tx[:, :, None] + rx[:, None]).reshape(len(rows), tx.shape[1] * rx.shape[1])
+        return np.exp(1j * self.wavenumber * length)
+
+
 @dataclass(frozen=True)
 class Chance:
     """Level of one UAV's own path in a frame, over the noise.
@@ -131,6 +156,9 @@ class Chance:
     ----------
     matched : SNR of the coherent matched filter
     cell : SNR in its cell of one channel's map
+    channels : SNR in its cell, all channels in phase
+    straddling : share of its power that is left where it lies between cells
+    whitened : SNR in its cell, channels whitened by the city's paths in it
     clutter : power of the diffuse paths in that cell
     background : what other paths add to the mean of the cells around it
     masked : a stronger path covers it
@@ -138,13 +166,22 @@ class Chance:
 
     matched: float
     cell: float
+    channels: float
+    straddling: float
+    whitened: float
     clutter: float
     background: float
     masked: bool
 
     @classmethod
     def of(
-        cls, own: int, paths: PathSet, places: Places, waveform: Waveform, sees: Sensitivity
+        cls,
+        own: int,
+        paths: PathSet,
+        places: Places,
+        waveform: Waveform,
+        sees: Sensitivity,
+        channels: Channels,
     ) -> Chance:
         """Return the chance of path number `own`."""
         w, power = waveform, paths.power
@@ -152,20 +189,57 @@ class Chance:
         life = max(min(paths.end[own], half) - max(paths.begin[own], -half), 0.0) / (2 * half)
         beat = float(w.beat_cells(paths.delay[own], paths.delay_rate[own], 0.0))
         doppler = places.velocity[own] / places.cells[1]
-        off_grid = float(
-            hann_response(np.array(beat - round(beat)))
-            * hann_response(np.array(doppler - round(doppler)))
-        )
+        off = np.array([beat - round(beat), doppler - round(doppler)])
+        off_grid = float(np.prod(hann_response(off)))
+        centre = np.array([places.range[own], places.velocity[own]]) - off * places.cells
         mine = power[own]
         diffuse = paths.kind == PathKind.DIFFUSE
         clutter, background, masked = _around(own, places, power, diffuse, mine * off_grid, sees)
+        cell = float(sees.cell * life**2 * mine * off_grid)
+        every = cell * sees.rule.looks
         return cls(
             float(sees.matched * life * mine),
-            float(sees.cell * life**2 * mine * off_grid),
+            cell,
+            every,
+            off_grid,
+            every * _whitened_share(own, centre, paths, places, sees, channels),
             sees.cell * clutter,
             background,
             masked,
         )
+
+
+def _whitened_share(
+    own: int,
+    centre: np.ndarray,
+    paths: PathSet,
+    places: Places,
+    sees: Sensitivity,
+    channels: Channels,
+) -> float:
+    """Return the share of a path's SNR over the channels of its cell that whitening leaves:
+    a^H R^-1 a / a^H a, with its phases a and the covariance R of unit noise and the city's paths.
+
+    The city's paths are those whose main lobe holds the cell, of true power and directions and
+    independent phases.
+
+    Parameters
+    ----------
+    own : row of the path
+    centre : range and velocity of the middle of its cell
+    """
+    city = (paths.kind == PathKind.DIFFUSE) | (paths.kind == PathKind.SPECULAR)
+    near = np.abs(places.range - centre[0]) < MAIN_LOBE * places.cells[0]
+    some = np.flatnonzero(city & near)
+    beside = places._replace(range=places.range[some], velocity=places.velocity[some])
+    row, column = beside.apart(*centre)
+    some, row, column = (values[column < MAIN_LOBE] for values in (some, row, column))
+    mine = channels.steering(paths, np.array([own]))[0]
+    groups = sees.rule.looks / len(mine)
+    power = groups * sees.cell * paths.power[some] * hann_response(row) * hann_response(column)
+    clutter = channels.steering(paths, some) * np.sqrt(power)[:, None]
+    covariance = np.eye(len(mine)) + clutter.T @ clutter.conj()
+    return float((mine.conj() @ np.linalg.solve(covariance, mine)).real / len(mine))
 
 
 def _around(
@@ -192,7 +266,7 @@ def _around(
     off, level, field = off[some], power[some], diffuse[some]
     near = places._replace(range=places.range[some], velocity=places.velocity[some])
     row, column = near.apart(places.range[own], places.velocity[own])
-    beside = field & (row < 2) & (column < 2)
+    beside = field & (row < MAIN_LOBE) & (column < MAIN_LOBE)
     clutter = level[beside] @ (hann_response(row[beside]) * hann_response(column[beside]))
     strong = ~field & (level > power[own])
     lobes = hann_envelope(row[strong]) * (hann_envelope(column[strong]) + UNION_FLOOR)

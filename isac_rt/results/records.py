@@ -78,6 +78,9 @@ class UavScores:
     loss : (U,) `isac_rt.results.losses.Loss` where it is in view and unshadowed, else -1
     target_snr : (U,) SNR of its own path behind a matched filter that is coherent over the whole
         frame (linear), NaN where it is not in view or shadowed
+    target_cell_snr, target_straddling, target_whitened_snr : (U,) its SNR in its cell of the
+        Hann-windowed map with all channels in phase (linear), the share of it that lying between
+        cells leaves, and the SNR after whitening by the true clutter, likewise
     target_clutter : (U,) power of the clutter in its cell over the noise (linear), likewise
     cooperative : (U,) bool; terminals, which report their position; none in a swarm of terminals
         alone, whose terminals are its targets
@@ -85,6 +88,8 @@ class UavScores:
         where it is not in view or shadowed
     clutter_free : (U,) probability that the receiver's detector would find it in noise alone,
         likewise
+    whitened : (U,) probability that a detector finds it that whitens the channels of its cell by
+        the true clutter, likewise
     """
 
     truth: UavValues
@@ -96,10 +101,14 @@ class UavScores:
     hit: np.ndarray
     loss: np.ndarray
     target_snr: np.ndarray
+    target_cell_snr: np.ndarray
+    target_straddling: np.ndarray
+    target_whitened_snr: np.ndarray
     target_clutter: np.ndarray
     cooperative: np.ndarray
     genie: np.ndarray
     clutter_free: np.ndarray
+    whitened: np.ndarray
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ three resolutions of it. Errors are those of detections and tracks that its own 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,15 +15,17 @@ from isac_rt.frame.antennas import Antennas, azimuth_elevation
 from isac_rt.frame.cube import Transmission
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.plain import Stateful
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections, Reception
 from isac_rt.results.bounds import CramerRao
 from isac_rt.results.labels import Aim, Places, explain, owners
-from isac_rt.results.losses import Chance, Sensitivity, cause_of
+from isac_rt.results.losses import Chance, Channels, Sensitivity, cause_of
 from isac_rt.results.metrics import (
     GATE_RESOLUTIONS,
+    GOSPA_CUTOFF_M,
     Resolution,
     SymbolCount,
     Truth,
@@ -42,7 +45,7 @@ from isac_rt.results.records import (
 )
 from isac_rt.track.parts import Late
 from isac_rt.track.tracker import TrackSet
-from isac_rt.world.swarm import Swarm
+from isac_rt.world.swarm import Pose, Swarm
 
 MISREAD = 0.5
 """Share of wrong delay symbols from which on a data frame shows nothing in its place."""
@@ -119,7 +122,7 @@ class Scorer(Stateful):
             symbols = count_symbols(sent.payload, reception, timetable.groups(self.link))
         read = symbols.delay_errors <= MISREAD * symbols.delay_total
         read &= symbols.frames == 0 or reception.placed
-        chances = self._chances(view, paths, sees)
+        chances = self._chances(view, paths, sees, sent.pose)
         raw = reception.raw_delay_symbols
         return ObserverRecord(
             transmitter=self.link.tx,
@@ -156,6 +159,10 @@ class Scorer(Stateful):
             beside = labels.kind[self._beside(view.seen[i], d)]
             own = bool((labels.uav == i).any())
             loss[i] = cause_of(bool(hit[i]), own, beside, chance, sees, read)
+
+        def by_uav(value: Callable[[Chance], float]) -> np.ndarray:
+            return np.array([value(chances[i]) if i in chances else np.nan for i in range(count)])
+
         return UavScores(
             truth=_values([None if t is None else np.array(t)[[0, 1, 4, 5]] for t in view.truth]),
             detected=_estimates(count, d.measured, best, observed),
@@ -165,11 +172,15 @@ class Scorer(Stateful):
             shadowed=view.inside & ~view.direct,
             hit=hit,
             loss=loss,
-            target_snr=_by_uav({i: c.matched for i, c in chances.items()}, count),
-            target_clutter=_by_uav({i: c.clutter for i, c in chances.items()}, count),
+            target_snr=by_uav(lambda c: c.matched),
+            target_cell_snr=by_uav(lambda c: c.channels),
+            target_straddling=by_uav(lambda c: c.straddling),
+            target_whitened_snr=by_uav(lambda c: c.whitened),
+            target_clutter=by_uav(lambda c: c.clutter),
             cooperative=reported,
-            genie=_by_uav({i: sees.genie(c.matched) for i, c in chances.items()}, count),
-            clutter_free=_by_uav({i: sees.clutter_free(c.cell) for i, c in chances.items()}, count),
+            genie=by_uav(lambda c: sees.genie(c.matched)),
+            clutter_free=by_uav(lambda c: sees.clutter_free(c.cell)),
+            whitened=by_uav(lambda c: sees.whitened(c.whitened)),
         )
 
     def late(self, frame: int, received: LinkResult) -> list[LateRecord]:
@@ -205,7 +216,7 @@ class Scorer(Stateful):
         seen = {i: t for i, t in enumerate(truth) if t is not None and inside[i] and direct[i]}
         positions = np.array([poses[name].position - own.position for name in names])
         directions = own.to_body(paths.arrival)[:, ::2]
-        return _View(truth, inside, direct, straight, seen, positions, directions)
+        return _View(own, truth, inside, direct, straight, seen, positions, directions)
 
     def _reported(self, frame: int) -> np.ndarray:
         """(U,) UAVs that are terminals in a frame and report their position; none in a swarm of
@@ -261,8 +272,9 @@ class Scorer(Stateful):
         """Return the tracks with what explains them and whom they follow, and the rows of those
         that follow the UAV whose own path explains their latest detection.
 
-        Confirmed tracks within the gate are assigned to UAVs one to one, a UAV to the track that
-        followed it last before others.
+        Confirmed tracks within the gate and, where both directions are observed, within the cutoff
+        of GOSPA are assigned to UAVs one to one, a UAV to the track that followed it last before
+        others.
 
         Parameters
         ----------
@@ -276,10 +288,11 @@ class Scorer(Stateful):
         self.state.labels = mine
         kind, target, uav = np.array([*mine.values()], int).reshape(-1, 3).T
         follows, rows = np.full(len(tracks), -1), np.flatnonzero(tracks.confirmed)
-        off = np.array(
-            [self._resolution.off(truth, tracks.measured[rows]) for truth in view.seen.values()]
-        )
-        off = off.reshape(len(view.seen), len(rows))
+        off = np.full((len(view.seen), len(rows)), np.inf)
+        for i, (u, truth) in enumerate(view.seen.items()):
+            apart = np.linalg.norm(tracks.mean[rows, :3] - view.positions[u], axis=1)
+            near = (apart < GOSPA_CUTOFF_M) | (not all(self._resolution.observed))
+            off[i, near] = self._resolution.off(truth, tracks.measured[rows[near]])
         last = np.array([self.state.followed.get(i, -1) for i in view.seen], int)
         stays = (tracks.ids[rows] == last[:, None]) & (off < GATE_RESOLUTIONS)
         cost = np.where(stays, 0.0, (off + GATE_RESOLUTIONS) / 2)
@@ -305,14 +318,18 @@ class Scorer(Stateful):
         )
         return table, own
 
-    def _chances(self, view: _View, paths: PathSet, sees: Sensitivity) -> dict[int, Chance]:
+    def _chances(
+        self, view: _View, paths: PathSet, sees: Sensitivity, tx: Pose
+    ) -> dict[int, Chance]:
         """Return the detection chance of the strongest straight path of each UAV seen."""
         w, out = self._timetable.waveform, {}
         places = Places.of(paths, w, self._passes)
+        wavenumber = 2 * np.pi * float(w.carrier()) / SPEED_OF_LIGHT
+        channels = Channels(self._antennas, wavenumber, tx, view.pose)
         for i in view.seen:
             mine = np.flatnonzero(view.straight == i)
             own = int(mine[np.argmax(paths.power[mine])])
-            out[i] = Chance.of(own, paths, places, w, sees)
+            out[i] = Chance.of(own, paths, places, w, sees, channels)
         return out
 
     def _bound(self, view: _View, chances: dict[int, Chance]) -> UavValues:
@@ -336,6 +353,7 @@ class _View:
 
     Attributes
     ----------
+    pose : of the receiver
     truth : of each of U UAVs, None for the receiver itself
     inside : (U,) in the field of view
     direct : (U,) reached straight, without the city
@@ -345,6 +363,7 @@ class _View:
     directions : (K, 2) u_x, u_z from which each path arrives
     """
 
+    pose: Pose
     truth: list[Truth | None]
     inside: np.ndarray
     direct: np.ndarray
@@ -352,10 +371,6 @@ class _View:
     seen: dict[int, Truth]
     positions: np.ndarray
     directions: np.ndarray
-
-
-def _by_uav(values: dict[int, float], count: int) -> np.ndarray:
-    return np.array([values.get(i, np.nan) for i in range(count)])
 
 
 def _reference_snr(paths: PathSet, amplitude: float, noise_power: float) -> float:

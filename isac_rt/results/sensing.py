@@ -19,6 +19,11 @@ from isac_rt.results.records import KINDS
 
 RATES = ("ser_delay", "ser_dpsk", "ber", "hit_rate", "tracked_rate")
 """Shares of a summary that have a numerator and a denominator."""
+BOUNDS = ("genie", "clutter_free", "whitened")
+"""Detectors that the receiver is compared with: a matched filter at the true parameters, its own in
+noise alone, and one that whitens the channels of a cell by the true clutter."""
+SNR = ("matched", "windows", "straddling", "clutter")
+"""SNR of a matched filter, and what windows, cells and whitening lose of it."""
 ERROR_KEYS = tuple(key for _, key in MEASURES.values())
 FALSE_CAUSES = (*KINDS, "noise")
 """What a false track is fed by; the last stands for -1."""
@@ -40,8 +45,8 @@ class Sensing:
     switched : (F, U) bool, another track follows it than the last that did
     resumed : (F, U) bool, followed again after frames in view in which no track did
     cooperative : (F, U) bool, terminals
-    genie, clutter_free : (F, U) probabilities of detection by a matched filter at the true
-        parameters, and by the receiver's detector in noise alone
+    bounds : (F, U, 3) probabilities of detection, by `BOUNDS`
+    snr : (F, U, 4) SNR of a matched filter and losses from it [dB], by `SNR`
     gospa : (F, 3) localisation, missed, false [m^2] of targets
     num_false, num_clutter : (F,) detections
     false_tracks : (F, kinds + 1) confirmed tracks far from every UAV, by `FALSE_CAUSES`
@@ -59,8 +64,8 @@ class Sensing:
     switched: np.ndarray
     resumed: np.ndarray
     cooperative: np.ndarray
-    genie: np.ndarray
-    clutter_free: np.ndarray
+    bounds: np.ndarray
+    snr: np.ndarray
     gospa: np.ndarray
     num_false: np.ndarray
     num_clutter: np.ndarray
@@ -109,8 +114,8 @@ class Sensing:
             np.array(values["loss"]),
             *_breaks(tracks, frame, in_view & ~shadowed),
             np.array(values["cooperative"]),
-            np.array(values["genie"]),
-            np.array(values["clutter_free"]),
+            np.stack([values[name] for name in BOUNDS], axis=-1),
+            _levels(values),
             np.stack([values[f"gospa_{part}"] for part in PARTS], axis=-1),
             np.array(values["num_false"]),
             np.array(values["num_clutter"]),
@@ -190,18 +195,28 @@ class Sensing:
         return {
             "in_view": in_view,
             **{name: share(int(one.sum()), in_view) for name, one in shares.items()},
-            "bounds": self._bounds(seen),
+            "bounds": _means(self.bounds[seen], BOUNDS),
+            "snr_db": _means(self.snr[seen], SNR),
             "rmse": _by_axis(self.detected[detected], rms),
             "rmse_tracked": _by_axis(self.tracked[tracked], rms),
             "losses": _counts(self.loss[seen]),
         }
 
-    def _bounds(self, seen: np.ndarray) -> dict[str, float | None]:
-        """Mean probabilities of detection over target-frames (F, U)."""
-        of = {"genie": self.genie, "clutter_free": self.clutter_free}
-        return {
-            name: float(values[seen].mean()) if seen.any() else None for name, values in of.items()
-        }
+
+def _means(values: np.ndarray, names: Sequence[str]) -> dict[str, float | None]:
+    """Average finite values (n, names) over target-frames; null of none."""
+    known = values[np.isfinite(values).all(axis=1)]
+    mean = known.mean(axis=0) if len(known) else [None] * len(names)
+    return {k: None if v is None else float(v) for k, v in zip(names, mean, strict=True)}
+
+
+def _levels(values: Columns) -> np.ndarray:
+    """(F, U, 4) `SNR` of the UAVs in view, NaN of the others [dB]."""
+    matched, cell, whitened = (values[f"target_{k}snr"] for k in ("", "cell_", "whitened_"))
+    share = values["target_straddling"]
+    with np.errstate(divide="ignore", invalid="ignore"):  # a path that begins at the frame's end
+        ratios = [matched, matched * share / cell, 1 / share, cell / whitened]
+        return np.stack([10 * np.log10(ratio) for ratio in ratios], axis=-1)
 
 
 def gospa_block(parts: np.ndarray, seen: np.ndarray) -> dict[str, float | None]:

@@ -42,13 +42,17 @@ LEGEND = {
     "Found": "Found: share of those in view with a detection of their own path within one "
     "resolution cell on every axis.",
     "Tracked": "Tracked: share of those in view with a confirmed track within three resolution "
-    "cells on every axis.",
+    "cells on every axis and 5 m.",
     "False tracks per frame": "False tracks: confirmed tracks that track no UAV, 5 m or more "
     "from every one.",
     "Noise only": "Noise only: mean detection probability of this detector in noise alone.",
     "Matched filter": "Matched filter: that of a filter at the true range, velocity and direction; "
     "no receiver finds more.",
-    "False alarms per frame": "False alarms: detections that no path explains.",
+    "Known clutter": "Known clutter: that of a detector in the target's cell that whitens the "
+    "channels by the true scatterers.",
+    "SNR [dB]": "SNR: mean of the matched filter. Windows, straddling, clutter: mean losses by "
+    "Hann windows, between cells, and to clutter after whitening.",
+    "False alarms": "False alarms: detections per frame that no path explains.",
     "GOSPA [m]": "GOSPA (p = 2, alpha = 2, c = 5 m): distance of the confirmed tracks from the "
     "targets; above \u201cNo tracks\u201d they are worse than none.",
     "n": "n: estimates caused by the UAV's own path within three resolution cells, the base of the "
@@ -131,13 +135,14 @@ def hit_table(summary: Mapping[str, Any], group: str) -> Table:
 
 
 def bound_table(summary: Mapping[str, Any], group: str) -> Table:
-    """Tabulate the share of ``targets`` or ``terminals`` found by link between its bounds."""
-    rows = [
-        (link, *map(number, (*part["bounds"].values(), part["hit_rate"], s["false_per_frame"])))
-        for link, s, part in _parts(summary, group)
-    ]
-    titles = ("Matched filter", "Noise only", "Found", "False alarms per frame")
-    return Table((f"Detection of {group}", *titles), rows)
+    """Tabulate the share of ``targets`` or ``terminals`` found by link, its bounds, and SNR."""
+    titles = ("Matched filter", "Noise only", "Known clutter", "Found", "False alarms")
+    losses = ("SNR [dB]", "Windows [dB]", "Straddling [dB]", "Clutter [dB]")
+    rows = []
+    for link, s, part in _parts(summary, group):
+        found = *part["bounds"].values(), part["hit_rate"], s["false_per_frame"]
+        rows.append((link, *map(number, (*found, *part["snr_db"].values()))))
+    return Table((f"Detection of {group}", *titles, *losses), rows)
 
 
 def rmse_table(summary: Mapping[str, Any], group: str) -> Table:

@@ -13,11 +13,11 @@ from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.receive.cfar import CfarRule
-from isac_rt.receive.maps import power_map
+from isac_rt.receive.maps import channel_maps, power_map
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.results.labels import Places
-from isac_rt.results.losses import Chance, Loss, Sensitivity, cause_of, single_look
+from isac_rt.results.labels import Places, hann_response
+from isac_rt.results.losses import Chance, Channels, Loss, Sensitivity, cause_of, single_look
 from isac_rt.world.swarm import Pose
 
 W = Waveform(num_samples=128, num_chirps=24)
@@ -35,16 +35,19 @@ def sent(schedule, payload, amplitude=1.0) -> Transmission:
     )
 
 
-def echo(length, rate, amplitude, others=()):
-    """A path set of an echo of U, and `others` of (length [m], rate [m/s], gain, kind)."""
-    rows = [(length, rate, amplitude, PathKind.TARGET), *others]
-    lengths, rates, gains, kinds = zip(*rows, strict=True)
+def echo(length, rate, amplitude, others=(), u=0.0):
+    """A path set of an echo of U from u_x, and `others` of (length [m], rate [m/s], gain, kind, and
+    u_x of departure and arrival)."""
+    rows = [(length, rate, amplitude, PathKind.TARGET, u, u)]
+    rows += [(*other, 0.0, 0.0)[:6] for other in others]
+    lengths, rates, gains, kinds, out, back = zip(*rows, strict=True)
+    ends = [np.column_stack([u, np.sqrt(1 - np.square(u)), np.zeros(len(u))]) for u in (out, back)]
     return make_paths(
         gain=np.array(gains),
         delay=np.array(lengths) / SPEED_OF_LIGHT,
         delay_rate=np.array(rates) / SPEED_OF_LIGHT,
-        departure=np.tile([0.0, 1.0, 0.0], (len(rows), 1)),
-        arrival=np.tile([0.0, 1.0, 0.0], (len(rows), 1)),
+        departure=ends[0],
+        arrival=ends[1],
         kind=np.array(kinds),
         target=np.array([0] + [-1] * (len(rows) - 1)),
         epoch=0.0,
@@ -55,7 +58,9 @@ def echo(length, rate, amplitude, others=()):
 
 
 def chance_of(paths, sees=SEES, waveform=W) -> Chance:
-    return Chance.of(0, paths, Places.of(paths, waveform, 2), waveform, sees)
+    wavenumber = 2 * np.pi * float(waveform.carrier()) / SPEED_OF_LIGHT
+    channels = Channels(ANTENNAS, wavenumber, Pose.at_rest(), Pose.at_rest())
+    return Chance.of(0, paths, Places.of(paths, waveform, 2), waveform, sees, channels)
 
 
 @pytest.mark.parametrize(("bins", "rows"), [(3.0, 11.0), (3.5, 11.0), (-2.3, 17.4)])
@@ -181,6 +186,47 @@ def background(*walls) -> float:
     return chance_of(echo(*place, 1.0, others)).background
 
 
+@pytest.mark.parametrize("bins", [11.0, 11.4])
+def test_whitened_channels_of_a_cell(bins):
+    """The receiver's transforms of the echo and of each scatterer alone give their channels in the
+    echo's cell, a and c_k; with the noise power of the maps a^H (N + sum c_k c_k^H)^-1 a is the SNR
+    after whitening. Three scatterers 20 dB and more over the noise of a channel within the main
+    lobe, one of them a beam aside at either end, cost 3 dB and more; another UAV's echo is no
+    clutter. 1 %: noise averaged over all cells, range-Doppler coupling within a frame. Planted
+    bugs: the window's response left out; departures for arrivals; the clutter of one group."""
+    w, schedule, payload = frame(waveform=W)
+    about, noise = known(w, schedule, payload), 2.9
+    length, rate = bins * w.range_cell(1), 3.0 * w.velocity_cell(1)
+    length -= float(w.beat_cells(0.0, rate / SPEED_OF_LIGHT, 0.0)) * w.range_cell(1)
+    walls = [
+        (length + r * w.range_cell(1), rate + b * w.velocity_cell(1), 0.5, kind, out, back)
+        for r, b, kind, out, back in (
+            (0.3, 0.0, PathKind.DIFFUSE, 0.02, 0.02),
+            (-0.6, 0.4, PathKind.DIFFUSE, 0.0, -0.09),
+            (0.2, -0.7, PathKind.SPECULAR, 0.11, 0.03),
+        )
+    ]
+
+    def channels(paths, noise=0.0):
+        made = cube(w, schedule, payload, paths, noise=noise, seed=5)
+        return np.fft.fftshift(channel_maps(clean_spectrum(made, about), about), axes=-1)
+
+    echo_alone = channels([Path(length, rate, 0.7, (0.05, 0.0), (0.05, 0.0))])
+    at = np.unravel_index((np.abs(echo_alone) ** 2).sum(axis=(0, 1)).argmax(), (64, 24))
+    a = echo_alone[:, :, *at].ravel()
+    covariance = (np.abs(channels([], noise)) ** 2).mean() * np.eye(a.size, dtype=complex)
+    for r, v, gain, _, out, back in walls:
+        c = channels([Path(r, v, gain, (back, 0.0), (out, 0.0))])[:, :, *at].ravel()
+        covariance += np.outer(c, c.conj())
+    expected = (a.conj() @ np.linalg.solve(covariance, a)).real
+    sees = Sensitivity.of(w, ANTENNAS, Receivers(), sent(schedule, payload), noise, 3)
+    other = (length, rate, 9.0, PathKind.GHOST)
+    found = chance_of(echo(length, rate, 0.7, [*walls, other], 0.05), sees, w)
+    assert found.whitened < found.channels / 2
+    assert found.whitened == pytest.approx(expected, rel=0.01)
+    assert found.straddling == pytest.approx(float(hann_response(bins - 11.0)), rel=1e-4)
+
+
 def test_background_is_the_greater_of_the_two_sides():
     """Behind and before the cell 4 and 2 times the noise, in 8 x 19 cells each, spread by 2.25; not
     the guard cells, nor what lies beyond the block on either axis, nor what is so strong that its
@@ -236,9 +282,11 @@ TRUTHS = {
 }
 
 
-def test_cells(**changed) -> Loss:
+def outcome(**changed) -> Loss:
     v = STRONG | changed
-    chance = Chance(v["matched"], v["cell"], v["clutter"], v["background"], v["masked"])
+    chance = Chance(
+        v["matched"], v["cell"], 0.0, 1.0, 0.0, v["clutter"], v["background"], v["masked"]
+    )
     return cause_of(v["hit"], v["own"], np.array(v["beside"], int), chance, SEES, v["read"])
 
 
@@ -246,7 +294,7 @@ def test_cells(**changed) -> Loss:
 def test_of_two_causes_the_first_counts(first, second):
     """Every cause alone and before every later one. Planted bug: masked asked before noise."""
     both = TRUTHS[max(first, second)] | TRUTHS[min(first, second)]
-    assert test_cells(**both) is min(first, second)
+    assert outcome(**both) is min(first, second)
 
 
 @pytest.mark.parametrize(
@@ -260,7 +308,7 @@ def test_of_two_causes_the_first_counts(first, second):
 )
 def test_clutter_in_the_cell_or_around_it(changed, loss):
     """Ten times the noise stands out of a background of 1 + 1.3, and not of 1 + 9."""
-    assert test_cells(**changed) is loss
+    assert outcome(**changed) is loss
 
 
 @pytest.mark.parametrize(
@@ -275,7 +323,7 @@ def test_clutter_in_the_cell_or_around_it(changed, loss):
 )
 def test_taken_for_something_else(beside, loss):
     """A detection in the UAV's cell that another path explains."""
-    assert test_cells(beside=beside) is loss
+    assert outcome(beside=beside) is loss
 
 
 def test_what_a_matched_filter_and_a_beam_would_find():

@@ -47,6 +47,7 @@ TERMINAL_KEYS = {
     "gospa",
     "cooperative",
     "in_view",
+    "snr_db",
     "tracked_rate",
     "bounds",
     "false_tracks_per_frame",

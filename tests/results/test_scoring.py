@@ -342,28 +342,30 @@ def test_targets_are_scored_without_the_terminals():
 
 def test_an_alias_or_a_drifted_track_does_not_stand_for_a_uav():
     """The own path explains them, more than three resolutions off: a velocity a period off, and a
-    track that went astray. Planted bug: no gate."""
+    track that went astray; one in the gate is 6 m off across. Planted bugs: no gate; no cutoff."""
     far = point("AT", "U1", DATA) + np.array([0, 2 * W.max_velocity(2), 0, 0])
     record = scored(scorer("AT"), DATA, [path_of("AT", "U1", DATA, 30.0)], [far])
     assert record.labels.kind.tolist() == [PathKind.TARGET]
     assert np.isnan(record.uavs.detected.range).all()
     assert record.uavs.loss[0] == Loss.INACCURATE
-    test_cells = scorer("AT")
+    judge = scorer("AT")
     tracks = [(1, True, 0, "U2", 0.0)]
     rows = [path_of("AT", "U1", DATA, 30.0)]
-    record = scored(test_cells, DATA, rows, [point("AT", "U1", DATA)], tracks)
+    record = scored(judge, DATA, rows, [point("AT", "U1", DATA)], tracks)
     assert record.tracks.kind.tolist() == [PathKind.TARGET]
     assert record.tracks.uav.tolist() == [-1]
+    record = scored(judge, DATA, rows, [], [(2, True, -1, "U1", -6.0)])
+    assert (record.tracks.uav.tolist(), record.tracks.false.tolist()) == ([-1], [True])
 
 
 def test_of_two_tracks_the_one_that_followed_goes_on():
     """Another track of U1 that is nearer does not take over while the first one lives."""
-    test_cells = scorer("AT")
+    judge = scorer("AT")
     rows = {f: [path_of("AT", "U1", f, 30.0)] for f in (DATA, DATA + 1)}
     found = {f: [point("AT", "U1", f)] * 2 for f in rows}
-    scored(test_cells, DATA, rows[DATA], found[DATA], [(7, True, 0, "U1", 0.0)])
+    scored(judge, DATA, rows[DATA], found[DATA], [(7, True, 0, "U1", 0.0)])
     tracks = [(3, True, 0, "U1", 0.0), (7, True, 1, "U1", 0.0)]
-    record = scored(test_cells, DATA + 1, rows[DATA + 1], found[DATA + 1], tracks)
+    record = scored(judge, DATA + 1, rows[DATA + 1], found[DATA + 1], tracks)
     assert record.tracks.uav.tolist() == [-1, 0]
     assert record.uavs.tracked.range[0] == record.tracks.range[1]
     assert np.isnan(record.uavs.tracked.range[1:]).all()
@@ -391,8 +393,8 @@ def test_what_is_outside_the_view_or_bent_is_not_asked_for():
     with a path counts wherever it is; bent paths count."""
     rows = [path_of("AT", "U1", DATA, 30.0)]
     narrow = replace(ANTENNAS, half_view=0.05)
-    test_cells = Scorer(Link("AT", "AT"), narrow, SWARM, TIMETABLE, Receivers())
-    record = scored(test_cells, DATA, rows)
+    judge = Scorer(Link("AT", "AT"), narrow, SWARM, TIMETABLE, Receivers())
+    record = scored(judge, DATA, rows)
     assert (record.uavs.in_view[0], record.uavs.shadowed[0], record.uavs.loss[0]) == (
         False,
         False,
@@ -432,9 +434,9 @@ def test_streams_and_blocks():
     table = timetable_of(
         SCENARIO.model_copy(update={"swarm": uavs, "modulation": streams}), W, TIMETABLE.schedule
     )
-    test_cells = Scorer(Link("AT", "PT1"), ANTENNAS, SWARM, table, Receivers())
+    judge = Scorer(Link("AT", "PT1"), ANTENNAS, SWARM, table, Receivers())
     sight = {f: [path_of("PT1", "AT", f, 3.0)] for f in (0, DATA)}
-    found = {f: scored(test_cells, f, paths) for f, paths in sight.items()}
+    found = {f: scored(judge, f, paths) for f, paths in sight.items()}
     assert found[0].uavs.target_snr[1] == pytest.approx(9 * MATCHED)
     assert found[DATA].uavs.target_snr[1] == pytest.approx(3 * MATCHED)
     later = SWARM.poses(TIMETABLE.epoch(DATA) + 3 * 2 * W.max_delay)

@@ -23,6 +23,11 @@ def row(seen=(1, 1), errors=(None, None), tracks=(), **more):
     out |= {
         "genie": np.where(seen, [0.9, 0.4], np.nan),
         "clutter_free": np.where(seen, 0.7, np.nan),
+        "whitened": np.where(seen, 0.6, np.nan),
+        "target_snr": np.where(seen, 100.0, np.nan),
+        "target_cell_snr": np.where(seen, 40.0, np.nan),
+        "target_straddling": np.where(seen, 0.8, np.nan),
+        "target_whitened_snr": np.where(seen, [20.0, 40.0], np.nan),
     }
     table = np.array(tracks, int).reshape(-1, 5)
     out["track"] = dict(zip(("id", "false", "kind", "target", "uav"), table.T, strict=True))
@@ -206,8 +211,11 @@ def test_targets_alone_are_scored_and_terminals_stand_beside():
     assert block["counts"]["hit_rate"] == [1, 2] and block["counts"]["tracked_rate"] == [2, 2]
     assert (terminals["in_view"], terminals["hit_rate"]) == (3, 1.0)
     assert terminals["tracked_rate"] == 0.0
-    assert block["bounds"] == pytest.approx({"genie": 0.9, "clutter_free": 0.7})
-    assert terminals["bounds"] == pytest.approx({"genie": 0.4, "clutter_free": 0.7})
+    assert block["bounds"] == pytest.approx({"genie": 0.9, "clutter_free": 0.7, "whitened": 0.6})
+    assert terminals["bounds"]["genie"] == pytest.approx(0.4)
+    levels = {"matched": 20, "windows": 3.01, "straddling": 0.97, "clutter": 3.01}
+    assert block["snr_db"] == pytest.approx(levels, abs=0.005)
+    assert terminals["snr_db"] == pytest.approx(levels | {"clutter": 0}, abs=0.005)
     assert block["gospa"]["total_m"] == pytest.approx(np.sqrt(12.5 / 3))
     assert block["gospa"]["empty_m"] == pytest.approx(np.sqrt(12.5 * 2 / 3))
     # errors of 1 and 3 cm of the target, of 5 cm of the terminal where both are in view
