@@ -109,7 +109,7 @@ PASSIVE_DETECTORS = Registry(
 SYMBOL_READERS = Registry(
     "symbol_readers",
     {
-        "powers": "isac_rt.receive.symbols.powers:ByPowers",
+        "powers": "isac_rt.receive.symbols:ByPowers",
         "beams": "isac_rt.extensions.city_receivers.beams:ByBeams",
     },
 )

@@ -19,8 +19,8 @@ import numpy as np
 import isac_rt as irt
 from isac_rt.receive import cfar, spectrum
 from isac_rt.receive import maps as doppler
+from isac_rt.receive import symbols as demodulate
 from isac_rt.receive.known import Known
-from isac_rt.receive.symbols import powers as demodulate
 
 scenario = irt.load(
     "../scenes/paper_swarm_consistent.yaml", ["propagation.leakage.enabled=false"], frames=200

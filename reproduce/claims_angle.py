@@ -14,7 +14,7 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.randomness import generator
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.symbols.powers import demodulate
+from isac_rt.receive.symbols import demodulate
 from reproduce import onepath
 from reproduce.outcome import Progress, Sentences, Verdict, proportion, table
 from reproduce.waves import prediction

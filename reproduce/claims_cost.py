@@ -20,7 +20,7 @@ from isac_rt.randomness import generator
 from isac_rt.receive.known import Known
 from isac_rt.receive.omp import omp
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.symbols.powers import decide, decide_transitions
+from isac_rt.receive.symbols import decide, decide_transitions
 from reproduce import onepath
 from reproduce.outcome import Progress, Sentences, Verdict, table
 

@@ -20,7 +20,7 @@ from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.symbols.powers import demodulate
+from isac_rt.receive.symbols import demodulate
 from reproduce import fig5, onepath
 from reproduce.outcome import Progress, Sentences, Verdict, proportion, table
 from reproduce.waves import prediction

@@ -36,7 +36,7 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.symbols.powers import decide, decide_transitions, known_cycles
+from isac_rt.receive.symbols import decide, decide_transitions, known_cycles
 from isac_rt.signal.if_signal import add_noise, if_signal
 from isac_rt.signal.methods import Auto
 from isac_rt.world.swarm import Pose

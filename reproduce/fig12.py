@@ -10,7 +10,7 @@ from scipy import stats
 
 from isac_rt.frame.payload import MODULATION_ORDERS
 from isac_rt.receive.clutter_filter import RUN_CELLS
-from isac_rt.receive.symbols.powers import EXTRA_CELLS
+from isac_rt.receive.symbols import EXTRA_CELLS
 from reproduce.montecarlo import INTERVAL, Curve, Precision, Steps, delay_error_rate
 from reproduce.outcome import (
     Outcome,

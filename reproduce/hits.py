@@ -40,7 +40,7 @@ from isac_rt.receive.passive import GATE_BINS, GATE_CELLS, predicted_cell
 from isac_rt.receive.sense import describe
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum, tones
-from isac_rt.receive.symbols.powers import demodulate
+from isac_rt.receive.symbols import demodulate
 from isac_rt.receive.types import Prediction
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct

@@ -5,7 +5,7 @@ receiver decides, in its derotated range cells: the transform of white noise is 
 signal and W the noise of a cell the summed power at noise level s is |S|^2 + 2 s Re(conj(S) W) +
 s^2 |W|^2 over the receive antennas, so that one transform serves all SNR points, and turning a
 chirp, noise and all, by its DPSK phase serves all orders. Decisions are those of
-`isac_rt.receive.symbols.powers`; a test gives both the same samples.
+`isac_rt.receive.symbols`; a test gives both the same samples.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from isac_rt.propagation.pathset import PathKind, merge
 from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import generator
 from isac_rt.receive.clutter_filter import runs
-from isac_rt.receive.symbols.powers import WEAKEST_WEIGHT, decide, decide_transitions, known_cycles
+from isac_rt.receive.symbols import WEAKEST_WEIGHT, decide, decide_transitions, known_cycles
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Auto, Direct
 from isac_rt.signal.noise import WhiteNoise

@@ -331,17 +331,17 @@ OF_CASES = {
         "kernels/signal_noise.py", "_same(uint32(low + uint32(i)))", "_same(uint32(i))"
     ),
     "dpsk symbol errors": Bug(
-        "receive/symbols/powers.py",
+        "receive/symbols.py",
         "product = chains[..., 1:] * chains[..., :-1].conj()",
         "product = chains[..., 1:] * chains[:, :, :1, :-1].conj()",
     ),
     "delay symbol errors": Bug(
-        "receive/symbols/powers.py",
+        "receive/symbols.py",
         "turn = tones(-beats[m] / w.num_samples, w.num_samples)",
         "turn = tones(-np.floor(beats[m]) / w.num_samples, w.num_samples)",
     ),
     "data at the ends of the velocity": Bug(
-        "receive/symbols/powers.py",
+        "receive/symbols.py",
         "w.data_phase(raw) - (w.slope * w.delay_step * raw) * delay",
         "w.data_phase(raw)",
     ),
@@ -775,7 +775,7 @@ OF_TESTS = (
     (
         "test_receive_data::test_a_frame_read_with_an_honest_prediction_is_not_erased",
         Bug(
-            "receive/symbols/powers.py",
+            "receive/symbols.py",
             "else min(least, symbols.phase_spread)",
             "else symbols.phase_spread",
         ),

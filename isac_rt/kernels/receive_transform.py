@@ -24,7 +24,7 @@ class Tables(NamedTuple):
 
 @jit(borrows=True)
 def transform(samples, factor, turn, powers, out, radices, twiddles, place, at, work):
-    """`isac_rt.receive.transform.fill_cells`."""
+    """`isac_rt.receive.spectrum.fill_cells`."""
     table, factors, turns, added, tapered = work
     num_rx, num_chirps, size = samples.shape[0], samples.shape[1], place.size
     lines = samples.reshape(num_rx * num_chirps, 2 * size)

@@ -19,7 +19,7 @@ from isac_rt.receive.omp import Omp
 from isac_rt.receive.pursuit import BySchedule, Pursuit
 from isac_rt.receive.sense import Cfar, Detector
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.symbols.powers import ByPowers
+from isac_rt.receive.symbols import ByPowers
 from isac_rt.receive.types import Detections
 from isac_rt.registry import DETECTORS, PASSIVE_DETECTORS, SYMBOL_READERS
 

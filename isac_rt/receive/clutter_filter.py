@@ -21,7 +21,7 @@ import numpy as np
 from scipy import special
 
 from isac_rt.frame.schedule import Schedule
-from isac_rt.receive.transform import transform
+from isac_rt.receive.spectrum import transform
 
 RUN_CELLS = 15
 """Consecutive occupied range cells from which on a run counts as clutter: below the 40 cells that

@@ -19,11 +19,11 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Cfar, Sensed, describe, make_maps, measure_channels
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import cleaned
-from isac_rt.receive.symbols.phases import decide_phases
-from isac_rt.receive.symbols.powers import (
+from isac_rt.receive.symbols import (
     ByPowers,
     Symbols,
     confidence_threshold,
+    decide_phases,
     moves_as_predicted,
     symbol_cells,
     transition_error_rate,

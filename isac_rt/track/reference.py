@@ -17,7 +17,7 @@ from scipy.special import gammainccinv
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.plain import Stateful
-from isac_rt.receive.symbols.powers import EXTRA_CELLS
+from isac_rt.receive.symbols import EXTRA_CELLS
 from isac_rt.receive.types import Detections, Prediction, Reception
 from isac_rt.track.filter import (
     Ambiguity,

@@ -143,14 +143,14 @@ kept.rebuild = lambda self, target, box: rebuild(self, target, *box)
     [
         ("kernels.signal_noise", "kernels/signal_noise.py"),
         ("kernels.signal_gridded", "kernels/vector.py"),
-        ("receive.transform", "kernels/fourier.py"),
+        ("receive.spectrum", "kernels/fourier.py"),
         ("extensions.two_bounces.two_bounces", "propagation/clutter/field.py"),
     ],
 )
 def test_every_kernel_that_is_called_counts(copy, module, file):
     """A line of any kernel of a module's own changes the folder; one that it does not use does not.
 
-    `receive.transform` imports its kernels as a module.
+    `receive.spectrum` imports its kernels as a module.
     """
     code = f"from isac_rt.kernels.jit import digest; print(digest('isac_rt.{module}'))"
     first = run(copy, code)

@@ -16,7 +16,7 @@ from isac_rt.kernels.receive_directions import REACH, TABLE_STEPS
 from isac_rt.kernels.receive_estimate import Chirps, WindowAxis
 from isac_rt.kernels.receive_maps import ROWS
 from isac_rt.kernels.vector import LANES, PART, aligned
-from isac_rt.receive import cfar, directions, estimate, maps, omp, pursuit, spectrum, transform
+from isac_rt.receive import cfar, directions, estimate, maps, omp, pursuit, spectrum
 from isac_rt.receive.joint import moments
 from isac_rt.receive.joint.tones import JointPath, Tones, powers_of_time
 from isac_rt.receive.known import Known
@@ -277,13 +277,13 @@ def test_cells_of_range_spectra(turned: bool):
     samples, factor = complex_noise(rng, 3, chirps, size), complex_noise(rng, chirps, size)
     cells, turn = np.array([-3, 0, 7, 41]), complex_noise(rng, 4, chirps) if turned else None
     results = []
-    for chosen in TWINS["isac_rt.receive.transform.fill_cells"]:
+    for chosen in TWINS["isac_rt.receive.spectrum.fill_cells"]:
         out = np.zeros((3, 4, chirps), np.complex64)
         power, tapered = np.zeros((2, chirps, size), np.float32)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(transform, "fill_cells", chosen)
+            patch.setattr(spectrum, "fill_cells", chosen)
             more = {"turn": turn, "power": power, "tapered": tapered}
-            transform.transform(samples, factor, cells, out, **more)
+            spectrum.transform(samples, factor, cells, out, **more)
         results.append((out, power, tapered))
     for found, expected in zip(*results, strict=True):
         most = np.abs(expected).max()

@@ -16,7 +16,7 @@ import numpy as np
 from isac_rt.kernels import jit
 jit.AVX512 = {wide}
 from isac_rt.kernels.vector import PART
-from isac_rt.receive.transform import transform
+from isac_rt.receive.spectrum import transform
 samples, factor = np.random.default_rng(8).standard_normal((2, 2, 16, 240, 2)) @ [1, 1j]
 out = np.zeros((2, 37, 16), np.complex64)
 transform(samples.astype(np.complex64), factor[0], np.arange(37), out)

@@ -10,7 +10,7 @@ import numpy as np
 from isac_rt.propagation.build import Ground
 from isac_rt.propagation.model import Census, Propagation, Traced
 from isac_rt.receive.sense import Cfar
-from isac_rt.receive.symbols.powers import ByPowers, Symbols
+from isac_rt.receive.symbols import ByPowers, Symbols
 from isac_rt.world.city.materials import MaterialUse
 from isac_rt.world.city.mesh import Surface
 from isac_rt.world.city.sources import CityParts

@@ -15,7 +15,7 @@ from isac_rt.receive.active import receive_active
 from isac_rt.receive.clutter_filter import occupied_factor, remove_static, runs
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.symbols.powers import demodulate
+from isac_rt.receive.symbols import demodulate
 from isac_rt.receive.types import Prediction
 
 SHORT = Waveform(num_samples=256)  # the paper's range cells, a quarter of its range and time

@@ -16,7 +16,7 @@ from isac_rt.frame.payload import gray_bits
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.symbols.powers import demodulate
+from isac_rt.receive.symbols import demodulate
 from isac_rt.receive.types import Prediction
 
 LENGTH, RATE, ARRIVAL = 43.817, -11.37, (0.31, -0.22)

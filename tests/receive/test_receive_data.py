@@ -18,7 +18,7 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.symbols.powers import (
+from isac_rt.receive.symbols import (
     Symbols,
     confidence_threshold,
     decide_transitions,

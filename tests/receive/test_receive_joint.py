@@ -36,7 +36,7 @@ from isac_rt.receive.joint.tones import (
 )
 from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.symbols.phases import decide_phases
+from isac_rt.receive.symbols import decide_phases
 from isac_rt.receive.types import Detections, Prediction
 
 ONE_DB = 10**0.1

@@ -18,8 +18,7 @@ from isac_rt.receive.maps import (
     slow_window,
     union_operator,
 )
-from isac_rt.receive.spectrum import _factors, tones
-from isac_rt.receive.transform import transform, transform_plain
+from isac_rt.receive.spectrum import _factors, tones, transform, transform_plain
 
 ROUNDING = 1e-6
 """Of sums in float32 over some hundred terms, relative RMS: some eps = 6e-8 times the root of the

@@ -14,7 +14,7 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import MODULATION_ORDERS, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.receive.clutter_filter import chirp_runs
-from isac_rt.receive.symbols.powers import demodulate
+from isac_rt.receive.symbols import demodulate
 from isac_rt.receive.types import Prediction
 from isac_rt.results.metrics import binomial_interval
 from reproduce import fig8, fig11, fig12, montecarlo

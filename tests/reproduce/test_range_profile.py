@@ -11,7 +11,7 @@ from receiver_cubes import ANTENNAS, Path, cube, frame
 
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive.symbols.powers import decide
+from isac_rt.receive.symbols import decide
 from isac_rt.receive.types import Prediction
 from reproduce.range_profile import correlate, derotation, learn_profile
 

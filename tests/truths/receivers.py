@@ -27,7 +27,7 @@ from isac_rt.receive.omp import omp
 from isac_rt.receive.sense import Cfar
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.symbols.powers import demodulate
+from isac_rt.receive.symbols import demodulate
 from isac_rt.receive.types import Prediction
 from truths import stage
 from truths.case import Errors, case, slow

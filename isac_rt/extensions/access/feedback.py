@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import gammainccinv
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive.symbols.powers import EXTRA_CELLS
+from isac_rt.receive.symbols import EXTRA_CELLS
 from isac_rt.receive.types import Reception
 from isac_rt.track.tracker import TrackSet
 

@@ -20,8 +20,8 @@ from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.clutter_filter import chirp_runs
-from isac_rt.receive.spectrum import tones
-from isac_rt.receive.symbols.powers import (
+from isac_rt.receive.spectrum import tones, transform
+from isac_rt.receive.symbols import (
     EXTRA_CELLS,
     WEAKEST_WEIGHT,
     ByPowers,
@@ -30,7 +30,6 @@ from isac_rt.receive.symbols.powers import (
     nearest_symbols,
     symbol_cells,
 )
-from isac_rt.receive.transform import transform
 from isac_rt.receive.types import Prediction
 
 SHARED_CELLS = 2.0

@@ -31,8 +31,8 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.vector import new_memory
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.directions import climbed, receiver_search
-from isac_rt.receive.symbols.powers import Symbols, known_cycles, nearest_symbols
-from isac_rt.receive.transform import transform
+from isac_rt.receive.spectrum import transform
+from isac_rt.receive.symbols import Symbols, known_cycles, nearest_symbols
 from isac_rt.receive.types import Prediction
 
 PEAKS = 4

@@ -30,7 +30,7 @@ from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.vector import LANES, new_memory
 from isac_rt.receive.joint.tones import Tones, Weights
 from isac_rt.receive.known import Known
-from isac_rt.receive.transform import transform
+from isac_rt.receive.spectrum import transform
 
 OVERSAMPLING, TAPS = 1.5, 8
 """Frequencies per cell, and those that a tone reads: an error of 1e-6 of the largest tone."""

@@ -1,1 +1,0 @@
-"""Symbol decisions of a passive terminal."""
