@@ -360,21 +360,41 @@ class Document:
                 here = here[key[-1]]
         return here, key
 
-    def check(self, root: type[Tree]) -> Tree:
+    def check(
+        self, root: type[Tree], tables: Sequence[Problem] = (), files: Sequence[Problem] = ()
+    ) -> Tree:
         """The values as a tree of class `root`.
+
+        Parameters
+        ----------
+        root : class of the tree
+        tables : problems of files whose numbers are missing in the mappings that name them
+        files : problems of other files
 
         Raises
         ------
         ScenarioError
-            With one line per problem, at most `MAX_MESSAGES`.
+            With one line per problem, at most `MAX_MESSAGES`: all that can be judged, of rules
+            between nodes those that read none that is malformed.
         """
+        lines: dict[Any, str] = {}
+        without = [problem.keys[0][:-1] for problem in tables]
+        broken = {str(key[0]) for key in without}
         try:
-            return root.model_validate(self.data)
+            tree = root.model_validate(self.data)
         except ValidationError as error:
-            lines = self._complaints(root, error)
-        more = len(lines) - MAX_MESSAGES
-        end = [f"... and {more} more"] if more > 0 else []
-        raise ScenarioError("\n".join([*lines[:MAX_MESSAGES], *end]))
+            found = [(_key_of(one), one) for one in error.errors()]
+            broken |= {str(key[0]) for key, _ in found if key}
+            for key, one in found:
+                if (key or not broken) and not any(key[: len(of)] == of for of in without):
+                    for about, line in self._complaints(root, key, one):
+                        lines.setdefault(about, line)
+        else:
+            if not tables and not files:
+                return tree
+        beside = root.judged_beside(self.data, broken) if broken else []
+        lines |= {problem: self.complaint(problem) for problem in (*tables, *beside, *files)}
+        raise ScenarioError(few_lines(list(lines.values())))
 
     def complaint(self, problem: Problem, below: Key = ()) -> str:
         """Say what is wrong, with its place. The first key is named; the place is that of an option
@@ -395,18 +415,23 @@ class Document:
         named_already = place.startswith((f"--set {dotted(named)}=", f"--{dotted(named)} "))
         return f"{place}: {text}" if named_already else f"{place}: {dotted(named)}{shown}: {text}"
 
-    def _complaints(self, root: type[Node], error: ValidationError) -> list[str]:
-        """All complaints of a validation, in the order of the tree."""
-        lines: dict[Any, str] = {}
-        for found in error.errors():
-            key: Key = tuple(part for part in found["loc"] if not _OF_A_TYPE.match(str(part)))
-            if found["type"] == "inconsistent":
-                for problem in found["ctx"]["problems"]:
-                    lines[key, problem] = self.complaint(problem, key)
-            else:
-                at = key[:-1] if found["type"] == "missing" and isinstance(key[-1], int) else key
-                lines.setdefault(key, self._line([at], _said(root, key, found)))
-        return list(lines.values())
+    def _complaints(self, root: type[Node], key: Key, found: Any) -> list[tuple[Any, str]]:
+        """Return the complaints of a finding of a validation, each with what it is about."""
+        if found["type"] == "inconsistent":
+            return [((key, p), self.complaint(p, key)) for p in found["ctx"]["problems"]]
+        at = key[:-1] if found["type"] == "missing" and isinstance(key[-1], int) else key
+        return [(key, self._line([at], _said(root, key, found)))]
+
+
+def few_lines(lines: Sequence[str]) -> str:
+    """Return lines of a message, at most `MAX_MESSAGES` of them."""
+    more = len(lines) - MAX_MESSAGES
+    return "\n".join([*lines[:MAX_MESSAGES], *([f"... and {more} more"] if more > 0 else [])])
+
+
+def _key_of(found: Any) -> Key:
+    """Return the key of what pydantic found."""
+    return tuple(part for part in found["loc"] if not _OF_A_TYPE.match(str(part)))
 
 
 def _said(root: type[Node], key: Key, found: Any) -> str:

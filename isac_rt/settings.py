@@ -4,7 +4,7 @@ numbers, and its complaints. The settings of a room stand in its `settings.py`."
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
@@ -81,6 +81,11 @@ class Node(BaseModel):
     def problems(self) -> Iterator[Problem]:
         """List contradictions within this mapping; keys are relative to it."""
         yield from ()
+
+    @classmethod
+    def judged_beside(cls, data: Any, broken: Set[str]) -> list[Problem]:
+        """List contradictions between the fields of malformed data that are not `broken`."""
+        return []
 
     def applies(self, name: str) -> bool:
         """Return whether a field has an effect besides the values of the others."""

@@ -5,15 +5,15 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from isac_rt.document import TAG, Document, Loader, ScenarioError, ScenarioWarning
+from isac_rt.document import TAG, Document, Loader, ScenarioWarning
 from isac_rt.scenario.doubts import doubts
-from isac_rt.scenario.tables import TableError, with_tables
+from isac_rt.scenario.tables import with_tables
 from isac_rt.scenario.tree import Scenario
 from isac_rt.settings import Problem, plain_tree
 
@@ -71,22 +71,26 @@ def load(
             document.data[name] = value
             document.places[(name,)] = f"--{name} {value}"
     folder = Path() if isinstance(path, Mapping) else document.path.parent
-    try:
-        document.data = with_tables(document.data, folder)
-    except TableError as problem:
-        raise ScenarioError(document.complaint(Problem((problem.key,), str(problem)))) from None
-    scenario = document.check(Scenario).in_folder(folder)
-    city = scenario.city
-    if city is not None and city.file is not None and not os.path.isfile(scenario.city_path()):
-        said = f"no such file in {folder}; the path is relative to the scenario's folder"
-        raise ScenarioError(document.complaint(Problem((("city", "file"),), said)))
-    board = scenario.calibration_path()
-    if board is not None and not os.path.isfile(board):
-        said = f"no such file in {folder}; make one with isac-rt calibrate --out {board}"
-        raise ScenarioError(document.complaint(Problem((("radio", "calibration"),), said)))
+    tables: list[Problem] = []
+    document.data = with_tables(document.data, folder, faults=tables)
+    missing = list(_missing_files(document.data, folder))
+    scenario = document.check(Scenario, tables, missing).in_folder(folder)
     for doubt in doubts(scenario):
         warnings.warn(document.complaint(doubt), ScenarioWarning, stacklevel=2)
     return scenario
+
+
+def _missing_files(tree: Mapping[str, Any], folder: Path) -> Iterator[Problem]:
+    """List files that a tree names and that are none."""
+    for node, key, make in (
+        ("city", "file", "the path is relative to the scenario's folder"),
+        ("radio", "calibration", "make one with isac-rt calibrate --out {}"),
+    ):
+        here = tree.get(node)
+        name = here.get(key) if isinstance(here, dict) else None
+        if isinstance(name, str) and not os.path.isfile(folder / name):
+            said = f"no such file in {folder}; {make.format(folder / name)}"
+            yield Problem(((node, key),), said)
 
 
 def folded_tree(scenario: Scenario, keys: Iterable[str]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from isac_rt.settings import Key
+from isac_rt.settings import Key, Problem
 from isac_rt.world.settings import City
 
 if TYPE_CHECKING:
@@ -255,11 +255,18 @@ def _tables_of(tree: dict[str, Any], folder: Path) -> Iterator[tuple[Key, str, R
         yield ("swarm", name, "rcs"), "file", _by_aspect("dbsm")
 
 
-def with_tables(tree: dict[str, Any], folder: Path, *, replace: bool = False) -> dict[str, Any]:
+def with_tables(
+    tree: dict[str, Any],
+    folder: Path,
+    *,
+    replace: bool = False,
+    faults: list[Problem] | None = None,
+) -> dict[str, Any]:
     """A scenario's tree with the numbers of the files that it names in place of their names.
 
     What is malformed stays as it is, for whoever checks it. `replace`: numbers that stand beside
-    the file give way, as those of a sweep's base do.
+    the file give way, as those of a sweep's base do. `faults`: filled with what is wrong instead of
+    raising it; such mappings stay as they are.
 
     Raises
     ------
@@ -276,11 +283,14 @@ def with_tables(tree: dict[str, Any], folder: Path, *, replace: bool = False) ->
             here = _at(out, key)
         try:
             found = reader(folder / file)
+            double = [k for k in found if here.get(k) is not None]
+            if double and not replace:
+                raise ValueError(f"stands beside {double[0]}; leave one of the two out")
         except ValueError as problem:
-            raise TableError((*key, name), str(problem)) from None
-        double = [k for k in found if here.get(k) is not None]
-        if double and not replace:
-            raise TableError((*key, name), f"stands beside {double[0]}; leave one of the two out")
+            if faults is None:
+                raise TableError((*key, name), str(problem)) from None
+            faults.append(Problem(((*key, name),), str(problem)))
+            continue
         del here[name]
         here.update(found)
     return out

@@ -12,7 +12,8 @@ import inspect
 import itertools
 import math
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Set
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,6 +21,7 @@ from pydantic import (
     Field,
     ModelWrapValidatorHandler,
     PrivateAttr,
+    TypeAdapter,
     ValidationError,
     model_validator,
 )
@@ -129,20 +131,7 @@ class Scenario(Node):
     @model_validator(mode="before")
     @classmethod
     def _presets(cls, data: Any) -> Any:
-        """Fill in what a sensor and presets say, and what the sets to compare take over."""
-        if not isinstance(data, dict):
-            return data
-        out = with_sensor(data)
-        out = with_preset(out, out.get("receiver_preset") or _usual_preset(out), {})
-        if isinstance(out.get("swarm"), dict):
-            out["swarm"] = unfolded(out["swarm"])
-        own = {key: _plain(out.get(key)) for key in ("receivers", "tracking")}
-        if isinstance(sets := out.get("compare"), dict):
-            out["compare"] = {
-                name: with_preset(one, one.get("preset"), own) if isinstance(one, dict) else one
-                for name, one in sets.items()
-            }
-        return out
+        return _with_presets(data)
 
     @property
     def folder(self) -> Path:
@@ -205,18 +194,54 @@ class Scenario(Node):
         return self.frames * (self.frame_interval_s or self.frame_duration_s)
 
     def problems(self) -> Iterator[Problem]:
-        yield from self._timing_problems()
-        yield from self._fmcw_problems()
-        yield from self._array_problems()
-        yield from self._swarm_problems()
-        yield from self._role_problems()
-        yield from self._block_problems()
-        yield from self._model_problems()
-        yield from self._front_end_problems()
-        yield from self._self_calibration_problems()
-        yield from self._set_problems()
+        for rule in self._rules():
+            yield from rule()
 
-    def _timing_problems(self) -> Iterator[Problem]:
+    def _rules(self) -> tuple[Callable[[], Iterator[Problem]], ...]:
+        """Return the rules between the nodes, each of which reads few of them."""
+        return (
+            self._slot_problems,
+            self._interval_problems,
+            self._acquisition_problems,
+            self._fmcw_role_problems,
+            self._fmcw_access_problems,
+            self._fmcw_array_problems,
+            self._fmcw_receiver_problems,
+            self._array_problems,
+            self._swarm_problems,
+            self._role_problems,
+            self._access_problems,
+            self._stream_problems,
+            self._block_problems,
+            self._rcs_problems,
+            self._clutter_problems,
+            self._detector_problems,
+            self._births_problems,
+            self._calibration_problems,
+            self._front_end_problems,
+            self._self_calibration_problems,
+            self._set_problems,
+        )
+
+    @classmethod
+    def judged_beside(cls, data: Any, broken: Set[str]) -> list[Problem]:
+        """List what the rules find that read none of the `broken` nodes."""
+        prepared, values = _with_presets(data), {}
+        for name, field in cls.model_fields.items():
+            if name in prepared and name not in broken:
+                kind: Any = Annotated[field.annotation, field]
+                values[name] = TypeAdapter(kind).validate_python(prepared[name])
+        scenario = cls.model_construct(**values)
+        for name in broken & cls.model_fields.keys():
+            scenario.__dict__.pop(name, None)  # whoever reads it meets an AttributeError
+        found: list[Problem] = []
+        for rule in scenario._rules():
+            with suppress(AttributeError):
+                for problem in rule():
+                    found.append(problem)
+        return found
+
+    def _slot_problems(self) -> Iterator[Problem]:
         sizes = (("array", "tx_x"), ("array", "tx_z"))
         of = " (array.tx_x + array.tx_z - 1)" if self.array.tx is None else ""
         antennas = f"the {self.num_tx} transmit antennas{of}"
@@ -234,6 +259,8 @@ class Scenario(Node):
                 "transmit antennas"
             )
             yield Problem((("radio", "groups"), *sizes), said)
+
+    def _interval_problems(self) -> Iterator[Problem]:
         if self.frame_interval_s is not None and self.frame_interval_s < self.frame_duration_s * (
             1 - 1e-12
         ):
@@ -246,6 +273,8 @@ class Scenario(Node):
                 f"is shorter than a frame, which lasts {self.frame_duration_s:.7g} s; lengthen it, "
                 "or leave it out for contiguous frames",
             )
+
+    def _acquisition_problems(self) -> Iterator[Problem]:
         carries = self.radio.mode == "isac"
         if carries and self.modulation.acquisition_frames >= self.frames:
             yield Problem(
@@ -271,19 +300,26 @@ class Scenario(Node):
                 f"scheme {r.scheme}; change one of them",
             )
 
-    def _fmcw_problems(self) -> Iterator[Problem]:
-        """List what a plain radar does not have, and what its receivers cannot do."""
-        r = self.radio
-        if r.mode == "isac":
+    def _fmcw_role_problems(self) -> Iterator[Problem]:
+        if self.radio.mode == "isac":
             return
         for name, uav in self.swarm.items():
             if uav.role == "passive":
                 said = "mode fmcw has no passive terminals; make it a target, or active"
                 yield Problem((("swarm", name, "role"), ("radio", "mode")), said)
-        for key, off in (("establish", False), ("feedback", False)):
-            if getattr(self.access, key) != off:
+
+    def _fmcw_access_problems(self) -> Iterator[Problem]:
+        if self.radio.mode == "isac":
+            return
+        for key in ("establish", "feedback"):
+            if getattr(self.access, key):
                 said = "mode fmcw has no links between terminals; leave it out"
                 yield Problem((("access", key), ("radio", "mode")), said)
+
+    def _fmcw_array_problems(self) -> Iterator[Problem]:
+        r = self.radio
+        if r.mode == "isac":
+            return
         if self.array.fall_back:
             said = "mode fmcw has its own order of antennas (radio.scheme); leave it out"
             yield Problem((("array", "fall_back"), ("radio", "mode")), said)
@@ -293,6 +329,12 @@ class Scenario(Node):
                 f"simo sends from one antenna, and there are {self.num_tx}; set array.tx_x and "
                 "array.tx_z to 1, or take another scheme",
             )
+
+    def _fmcw_receiver_problems(self) -> Iterator[Problem]:
+        """List what a plain radar's receivers cannot do."""
+        r = self.radio
+        if r.mode == "isac":
+            return
         usual: dict[str, tuple[str, ...]] = {
             "velocity_method": ("auto", "latin_union", "conventional")
         }
@@ -359,7 +401,6 @@ class Scenario(Node):
 
     def _role_problems(self) -> Iterator[Problem]:
         roles, last = {name: uav.role for name, uav in self.swarm.items()}, 0
-        ever_passive = {name for name, role in roles.items() if role == "passive"}
         for i, change in enumerate(self.role_changes):
             key = ("role_changes", i)
             if change.frame <= last or change.frame >= self.frames:
@@ -379,7 +420,8 @@ class Scenario(Node):
                         ((*key, end), ("swarm",)), f"{name} {now}; name a UAV that is {role} then"
                     )
             roles |= {change.from_uav: "passive", change.to_uav: "active"}
-            ever_passive.add(change.from_uav)
+
+    def _access_problems(self) -> Iterator[Problem]:
         if self.access.synchronisation == "two_round" and not self.access.establish:
             said = (
                 "two_round measures clocks in the stages before the data; set access.establish: "
@@ -398,6 +440,10 @@ class Scenario(Node):
                 "needs them again; leave one of the two out"
             )
             yield Problem((("access", "establish"), ("role_changes",)), said)
+
+    def _stream_problems(self) -> Iterator[Problem]:
+        ever_passive = {name for name, uav in self.swarm.items() if uav.role == "passive"}
+        ever_passive |= {change.from_uav for change in self.role_changes}
         for name, groups in self.modulation.streams.items():
             stream: Key = ("modulation", "streams", name)
             if name not in ever_passive:
@@ -453,10 +499,12 @@ class Scenario(Node):
             if receivers.self_calibration != "none":
                 yield Problem(((*at, "self_calibration"), ("radio", "groups")), said)
 
-    def _front_end_problems(self) -> Iterator[Problem]:
+    def _calibration_problems(self) -> Iterator[Problem]:
         if self.radio.calibration is not None and self.radio.bands(self.num_tx) > 1:
             said = "gains of antennas that send at once cannot be told in the samples; take tdm"
             yield Problem((("radio", "scheme"), ("radio", "calibration")), said)
+
+    def _front_end_problems(self) -> Iterator[Problem]:
         stated: dict[Key, FrontEnd] = {("radio", "front_end"): self.radio.front_end}
         stated |= {
             ("swarm", name, "front_end"): uav.front_end
@@ -510,7 +558,7 @@ class Scenario(Node):
                 taken |= set(range(block, block + self.radio.groups))
         return {name: out[name] for name in active}
 
-    def _model_problems(self) -> Iterator[Problem]:
+    def _rcs_problems(self) -> Iterator[Problem]:
         for name, uav in self.swarm.items():
             if uav.rcs.model == "relative" and self.propagation.model != "free_space":
                 yield Problem(
@@ -525,6 +573,8 @@ class Scenario(Node):
                     "relative goes with noise.model snr only: a link budget needs a radar "
                     "cross-section; use constant or tr38901",
                 )
+
+    def _clutter_problems(self) -> Iterator[Problem]:
         if self.clutter.model == "field" and (
             self.propagation.model != "ray_traced" or self.city is None
         ):
@@ -533,21 +583,26 @@ class Scenario(Node):
                 "field needs propagation.model ray_traced and a city to scatter from; "
                 "add them or set clutter.model to none",
             )
-        traced = self.propagation.model == "ray_traced" and self.city is not None
-        sets: dict[Key, Scenario | ReceiverSet] = {(): self}
-        sets |= {("compare", name): one for name, one in self.compare.items()}
-        for above, one in sets.items():
-            if one.receivers.needs_mesh and not traced:
-                detector = (*above, "receivers", "clutter_detector")
+
+    def _detector_problems(self) -> Iterator[Problem]:
+        for at, one in self._all_receivers().items():
+            traced = self.propagation.model == "ray_traced" and self.city is not None
+            if one.needs_mesh and not traced:
+                detector = (*at, "clutter_detector")
                 yield Problem(
                     (detector, ("propagation", "model"), ("city",)),
-                    f"{one.receivers.clutter_detector} predicts clutter from a city's mesh: it "
+                    f"{one.clutter_detector} predicts clutter from a city's mesh: it "
                     "needs propagation.model ray_traced and a city; "
                     f"add them or set {dotted(detector)} to cfar",
                 )
-            if one.tracking.needs_mesh and self.city is None:
-                births = (*above, "tracking", "births")
-                said = f"{one.tracking.births} needs a city; add one or set {dotted(births)} to all"
+
+    def _births_problems(self) -> Iterator[Problem]:
+        sets: dict[Key, Tracking] = {("tracking",): self.tracking}
+        sets |= {("compare", name, "tracking"): x.tracking for name, x in self.compare.items()}
+        for at, one in sets.items():
+            if one.needs_mesh and self.city is None:
+                births = (*at, "births")
+                said = f"{one.births} needs a city; add one or set {dotted(births)} to all"
                 yield Problem((births, ("city",)), said)
 
     def _set_problems(self) -> Iterator[Problem]:
@@ -577,6 +632,23 @@ def _fits(key: str, value: str, values: tuple[str, ...]) -> bool:
     """Return whether a setting of receivers has one of some values, or names another package's
     part, of which nothing is known."""
     return value in values or (key in _PARTS and value not in _PARTS[key].own)
+
+
+def _with_presets(data: Any) -> Any:
+    """Fill in what a sensor and presets say, and what the sets to compare take over."""
+    if not isinstance(data, dict):
+        return data
+    out = with_sensor(data)
+    out = with_preset(out, out.get("receiver_preset") or _usual_preset(out), {})
+    if isinstance(out.get("swarm"), dict):
+        out["swarm"] = unfolded(out["swarm"])
+    own = {key: _plain(out.get(key)) for key in ("receivers", "tracking")}
+    if isinstance(sets := out.get("compare"), dict):
+        out["compare"] = {
+            name: with_preset(one, one.get("preset"), own) if isinstance(one, dict) else one
+            for name, one in sets.items()
+        }
+    return out
 
 
 def _usual_preset(data: dict[str, Any]) -> Preset:
