@@ -243,7 +243,7 @@ MAX_LINES = {
     "signal": 850,
     "receive": 6100,
     "track": 1850,
-    "scenario": 1630,
+    "scenario": 1710,
     "results": 3580,
     "simulation": 3400,
     "sweep": 2350,
