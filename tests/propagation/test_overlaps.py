@@ -49,19 +49,22 @@ def footprints(path, houses, degrees=False):
     path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
 
 
-def field_and_clutter(folder, file, **city):
-    """The clutter field of a radar before a facade, and the power that returns to it [dB]."""
+def field_and_clutter(folder, file, *, seed=1, passive=False, **city):
+    """The clutter field of a radar before a facade, and the power that returns to it, or that comes
+    to a passive terminal [dB]."""
     here = {"role": "active", "position_m": [-5, 0, 6], "boresight": [1, 0, 0]}
-    target = {"role": "target", "position_m": [0, 5, 8]}
+    role = {"role": "passive" if passive else "target", "boresight": [1, 0, 0]}
+    target = {"position_m": [0, 5, 8], **role}
     tree = {
         "frames": 6,
+        "seed": seed,
         "city": {"file": str(folder / file), **city},
         "swarm": {"AT": here, "U": target},
         "propagation": {"model": "ray_traced", "max_bounces": 1},
         "clutter": {"model": "field"},
     }
     setup = prepare(load(tree))
-    (paths,) = setup.find(0)[1].values()
+    paths = setup.find(0)[1]["AT", "U" if passive else "AT"]
     power = paths.power[paths.kind == PathKind.DIFFUSE].sum()
     return setup.propagation.field, 10 * np.log10(power)
 
@@ -86,6 +89,38 @@ def test_walls_that_lie_twice_are_one_surface(tmp_path, alone, name):
     assert clutter == pytest.approx(alone, abs=0.2)
     if name == "two heights":  # of the facade, for the other walls are out of sight
         assert field.overlap == pytest.approx(19.5 * 100, rel=0.05)
+
+
+@pytest.mark.sionna
+@pytest.mark.filterwarnings("ignore::isac_rt.document.ScenarioWarning")
+def test_a_higher_part_adds_the_wall_above_its_building(tmp_path):
+    """A building of six levels with a part of eight, at a passive terminal, over 6 draws: the mean
+    is within 0.2 dB of the same solid without a surface twice (a draw fluctuates by 0.11 dB,
+    so that the means differ by 0.07 at one sigma). Against the building alone that solid,
+    drawn alike, adds 0.05 to 0.2 dB, the 30 by 6 m of wall above it. Planted bug: surfaces that lie
+    twice scatter twice."""
+    building = (WHOLE, {"building": "yes", "building:levels": "6"})
+    part = {"building:part": "yes", "building:levels": "8"}
+    houses = {
+        "alone": [building],
+        "part": [building, ((10, -15, 30, 15), part)],
+        "solid": [building, ((10, -15, 30, 15), part | {"min_height": "18"})],
+    }
+    draws: dict[str, np.ndarray] = {}
+    for name, every in houses.items():
+        footprints(tmp_path / f"{name}.geojson", every)
+        given = {"passive": True, "source": "footprints"}
+        draws[name] = np.array(
+            [
+                field_and_clutter(tmp_path, f"{name}.geojson", seed=seed, **given)[1]
+                for seed in range(6)
+            ]
+        )
+    mean = {name: 10 * np.log10(np.mean(10 ** (each / 10))) for name, each in draws.items()}
+    print(mean, {name: each.std() for name, each in draws.items()})
+    assert mean["part"] == pytest.approx(mean["solid"], abs=0.2)
+    added = draws["solid"] - draws["alone"]
+    assert 0.05 < added.min() and added.max() < 0.2
 
 
 @pytest.mark.sionna
