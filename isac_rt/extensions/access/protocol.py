@@ -26,8 +26,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from isac_rt.extensions.access.identify import choose_run, consensus, hot_chirps, needed_chirps
-from isac_rt.extensions.access.ook import Codebook, Message, keyed, read
+from isac_rt.extensions.access.ook import (
+    Codebook,
+    Message,
+    choose_run,
+    consensus,
+    hot_chirps,
+    keyed,
+    needed_chirps,
+    read,
+)
 from isac_rt.extensions.access.synchronise import (
     EXTERNAL,
     ClockEstimate,

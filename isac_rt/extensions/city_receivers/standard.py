@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -13,23 +13,58 @@ from isac_rt.extensions.city_receivers.images import Images
 from isac_rt.extensions.city_receivers.known_paths import LearnedHardware
 from isac_rt.extensions.city_receivers.out_of_sequence import OutOfSequence
 from isac_rt.extensions.city_receivers.static_clutter import StaticClutter, rests
-from isac_rt.extensions.city_receivers.waits import AwaitedReports, PlacedTransmitter
 from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import ExpectedClutter, Gates
+from isac_rt.receive.types import Detections, ExpectedClutter, Gates
 from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import Setup
 from isac_rt.track.filter import Gaussian, reported
-from isac_rt.track.parts import Equipment, HardwareModel, OtherPaths, Own, TrackRule, of_itself
+from isac_rt.track.parts import (
+    Equipment,
+    HardwareModel,
+    OtherPaths,
+    Own,
+    TrackRule,
+    is_placed,
+    of_itself,
+)
 from isac_rt.track.settings import Tracking
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
 from isac_rt.track.tracker import Track, Tracker
 from isac_rt.world.swarm import Pose
+
+REPORT_FRAMES = 5
+"""A passive terminal to which others report confirms none of its own tracks before so many frames
+after the first detection. It cannot see what flies near its line of sight, but receives its echoes
+over walls. The active terminal sees such a target a frame later at worst, confirms it in the third
+frame, and its report takes two more."""
+
+
+class PlacedTransmitter(TrackRule):
+    """No track starts while the transmitter's motion is not known to a Doppler `cell` [m/s]: the
+    expected clutter explains nothing before."""
+
+    def __init__(self, cell: float) -> None:
+        self._cell = cell
+
+    def births(self, detections: Detections, own: Own) -> Detections:
+        if own.transmitter is None or is_placed(own.transmitter, self._cell):
+            return detections
+        return replace(detections, starts=np.zeros(len(detections), bool))
+
+
+class AwaitedReports(TrackRule):
+    """No track is confirmed before others could have reported the target (`REPORT_FRAMES`)."""
+
+    def prune(self, tracker: Tracker, own: Own) -> None:
+        if own.cooperates:
+            for track in tracker.tracks:
+                track.confirmed &= track.age >= REPORT_FRAMES
 
 
 @dataclass(frozen=True)

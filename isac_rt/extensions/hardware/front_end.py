@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from isac_rt.extensions.hardware.channels import Elements, elements_of
+from isac_rt.extensions.hardware.channels import Elements, Shifter, elements_of, shifter_of
 from isac_rt.extensions.hardware.converter import Converter, converter_of, watts
 from isac_rt.extensions.hardware.oscillator import Oscillator, oscillator_of
-from isac_rt.extensions.hardware.shifter import Shifter, shifter_of
 from isac_rt.extensions.hardware.sweep import Ramp, Response, ramp_of, response_of
 from isac_rt.frame import front_end as settings
 from isac_rt.frame.antennas import Antennas

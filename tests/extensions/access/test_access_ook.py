@@ -7,15 +7,20 @@ import numpy as np
 import pytest
 from scipy import integrate, special, stats
 
-from isac_rt.extensions.access.identify import (
+from isac_rt.extensions.access.ook import (
     HOT_RATE,
+    Codebook,
+    Message,
     choose_run,
     consensus,
     hot_chirps,
     hot_threshold,
+    keyed,
     needed_chirps,
+    read,
+    repeats,
+    threshold,
 )
-from isac_rt.extensions.access.ook import Codebook, Message, keyed, read, repeats, threshold
 from isac_rt.frame.waveform import Waveform
 
 SIGMAS = 4.5  # statistical: fails by chance once in 10^5

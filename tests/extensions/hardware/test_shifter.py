@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.extensions.hardware.shifter import shifter_of
+from isac_rt.extensions.hardware.channels import shifter_of
 from isac_rt.frame.front_end import FrontEnd, Shifter
 
 
