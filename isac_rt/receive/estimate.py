@@ -436,22 +436,17 @@ class Estimator:
 OFF_GRID = Estimator()
 
 
-def direction_cosine(
+def cosines_along(
     channels: np.ndarray, known: Known, axis: int, *, on_grid: bool = False
-) -> float:
-    """Direction cosine along one axis of the L from the channel responses, by maximising the
-    beamformed power.
+) -> np.ndarray:
+    """Return direction cosines (Q,) along one axis of the L from channel responses (Q, L_tx, L_rx),
+    by maximising the beamformed power.
 
     An element at r answers with exp(-j 2 pi f r u / c), f the frequency at the window's middle.
     Echoes are combined coherently over both arrays; one-way paths coherently over the
     receivers and in power over the transmitters, whose direction of departure is another and
     ambiguous.
     """
-    return float(_along(channels[None], known, axis, on_grid=on_grid)[0])
-
-
-def _along(channels: np.ndarray, known: Known, axis: int, *, on_grid: bool) -> np.ndarray:
-    """(Q,) `direction_cosine` of channels (Q, L_tx, L_rx)."""
     a, echo, line = known.antennas, known.passes == 2, arm(known.antennas, axis, known.passes)
     if not a.observes(known.passes)[axis // 2]:
         return np.full(len(channels), np.nan)
@@ -531,7 +526,9 @@ def _cosines(channels: np.ndarray, known: Known, *, on_grid: bool) -> np.ndarray
     if not known.antennas.is_l:
         found = [planar.cosines(one, known, on_grid=on_grid) for one in channels]
         return np.array(found, float).reshape(-1, 2)
-    return np.stack([_along(channels, known, axis, on_grid=on_grid) for axis in (0, 2)], axis=1)
+    return np.stack(
+        [cosines_along(channels, known, axis, on_grid=on_grid) for axis in (0, 2)], axis=1
+    )
 
 
 def in_plane(u: np.ndarray, known: Known) -> np.ndarray:

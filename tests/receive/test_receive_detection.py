@@ -28,7 +28,7 @@ from isac_rt.receive.chain import passive_detector_of
 from isac_rt.receive.estimate import (
     STENCILS,
     LocalSpectra,
-    direction_cosine,
+    cosines_along,
     directions,
     excess,
     hann_response,
@@ -455,7 +455,7 @@ def test_beamformer_against_its_signal(virtual: bool):
         channels = np.exp(-1j * middle * (tx[:, None] + rx[None, :]))
         sent = known(w, frame()[1], unmodulated(w), passes=2 if virtual else 1)
         # window's middle is 9 samples off
-        assert direction_cosine(channels, sent, axis) == pytest.approx(u, abs=1e-4)
+        assert cosines_along(channels[None], sent, axis) == pytest.approx(u, abs=1e-4)
 
 
 def test_outside_the_field_of_view_there_is_no_direction():

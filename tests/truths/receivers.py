@@ -20,7 +20,7 @@ from isac_rt.receive.active import receive_active
 from isac_rt.receive.arms import arm
 from isac_rt.receive.cfar import CfarRule, greatest_of_factor
 from isac_rt.receive.clutter_filter import remove_static
-from isac_rt.receive.estimate import direction_cosine
+from isac_rt.receive.estimate import cosines_along
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps, slow_window, union_operator
 from isac_rt.receive.omp import omp
@@ -387,7 +387,7 @@ def scatter_of_directions() -> Errors:
             channels = clean + np.sqrt(noise / 2) * rng.normal(size=(*clean.shape, 2)) @ np.array(
                 [1, 1j]
             )
-            errors.append(direction_cosine(channels, known, axis) - u)
+            errors.append(cosines_along(channels[None], known, axis)[0] - u)
         sigma = np.sqrt(noise / 2 / spread) / scale
         yield abs(np.mean(np.square(errors)) / sigma**2 - 1) / np.sqrt(2 / count)
         yield abs(np.mean(errors)) / sigma * np.sqrt(count)
