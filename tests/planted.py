@@ -725,6 +725,22 @@ OF_TESTS = (
         ),
     ),
     (
+        "test_losses::test_whitened_channels_of_a_cell",
+        Bug("results/losses.py", "paths.departure[rows]", "paths.arrival[rows]"),
+    ),
+    (
+        "test_metrics::test_targets_are_scored_among_all_uavs",
+        Bug("results/metrics.py", "other[track] = not scored[uav]", "other[track] = False"),
+    ),
+    (
+        "test_scoring::test_an_alias_or_a_drifted_track_does_not_stand_for_a_uav",
+        Bug("results/scoring.py", "near = (apart < GOSPA_CUTOFF_M) |", "near = (apart < np.inf) |"),
+    ),
+    (
+        "test_swarm_scores::test_tracked_is_within_three_resolutions_of_a_link_that_sees_it",
+        Bug("results/swarm.py", "replace(b, velocity=s[3:])", "replace(b, velocity=0 * s[3:])"),
+    ),
+    (
         "test_scoring::test_gospa_is_of_confirmed_tracks_and_targets_in_view",
         Bug("results/scoring.py", "get(track, [-1, -1, -1])", "get(track, [0, 0, 0])"),
     ),

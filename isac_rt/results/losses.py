@@ -234,6 +234,8 @@ def _whitened_share(
     beside = places._replace(range=places.range[some], velocity=places.velocity[some])
     row, column = beside.apart(*centre)
     some, row, column = (values[column < MAIN_LOBE] for values in (some, row, column))
+    if not len(some):
+        return 1.0
     mine = channels.steering(paths, np.array([own]))[0]
     groups = sees.rule.looks / len(mine)
     power = groups * sees.cell * paths.power[some] * hann_response(row) * hann_response(column)
