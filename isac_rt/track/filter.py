@@ -22,6 +22,9 @@ range, 0.02 in velocity, 0.002 in angle."""
 BIRTH_SPEED_STD = 10.0
 """Per axis [m/s]: before its first detection a UAV is taken to stand still in the world, give or
 take this."""
+BIRTH_SPEED_DEVIATIONS = 3.0
+"""A folded velocity is also read as its second nearest to standing still, up to this many of those
+deviations."""
 BIRTH_POSITION_STD_LIMIT = 100.0
 """A single detection that fixes the position worse than this [m] starts no track (near the line
 through both terminals a bistatic length says nothing about where the reflector is)."""
@@ -348,11 +351,11 @@ def births(
     acceleration_std: float,
     ambiguity: Ambiguity = UNAMBIGUOUS,
 ) -> tuple[np.ndarray, Gaussian]:
-    """Return which of the detections (Q, 4) with deviations (Q, 4) fix a position, (K,), and the
-    states (K, 9) after each.
+    """Return the numbers of the detections (Q, 4) with deviations (Q, 4) that fix a position, (K,),
+    and the states (K, 9) after each.
 
-    Of what the `ambiguity` leaves open the reading counts that is nearest to standing still. The
-    position from range and direction (front half-space), its covariance through the inverse
+    Of what the `ambiguity` leaves open the two readings nearest to standing still count, the
+    second ones after all first ones, unless they are faster than UAVs fly. The position from range and direction (front half-space), its covariance through the inverse
     Jacobian; the velocity is zero in the world with `BIRTH_SPEED_STD` per axis, conditioned on the
     measured rate: the component along the line of sight (or the bisector) is then known, the others
     are not. The acceleration is zero with `acceleration_std` [m/s^2] per axis.
@@ -360,16 +363,26 @@ def births(
     there = None if transmitter is None else transmitter.mean
     mean = _resting(measurement, own, there)
     off = measurement - measure(mean, own, there)
-    read = measurement + (wrapped(off, ambiguity) - off)
+    near = wrapped(off, ambiguity)
+    read = measurement + (near - off)
+    which = np.arange(len(measurement))
+    if np.isfinite(ambiguity.period):
+        period, shift = ambiguity
+        far = read + np.sign(near[:, 1:2]) * [shift, -period, 0.0, 0.0]
+        read, which = np.concatenate([read, far]), np.append(which, which)
     mean = _resting(read, own, there)
-    J = jacobian(mean, own, there)[:, _POSITION, :3]
+    H = jacobian(mean, own, there)
+    speed = np.abs((read - measure(mean, own, there))[:, 1])
+    limit = BIRTH_SPEED_DEVIATIONS * BIRTH_SPEED_STD * np.linalg.norm(H[:, 1, 3:6], axis=1)
+    fits = (np.arange(len(read)) < len(measurement)) | (speed <= limit)
+    J = H[:, _POSITION, :3]
     rho = np.linalg.norm(mean[:, :3] - own.position, axis=1)
     in_metres = J * np.stack([np.ones_like(rho), rho, rho], axis=1)[..., None]
-    which = np.flatnonzero(np.isfinite(J).all(axis=(1, 2)) & np.isfinite(read).all(axis=1))
-    which = which[np.linalg.cond(in_metres[which]) <= 1e6]
-    mean, read = mean[which], read[which]
+    some = np.flatnonzero(fits & np.isfinite(J).all(axis=(1, 2)) & np.isfinite(read).all(axis=1))
+    some = some[np.linalg.cond(in_metres[some]) <= 1e6]
+    which, mean, read = which[some], mean[some], read[some]
     R = measurement_covariance(std[which], mean, transmitter)
-    back = np.linalg.inv(J[which])
+    back = np.linalg.inv(J[some])
     position = back @ R[:, _POSITION[:, None], _POSITION] @ np.swapaxes(back, 1, 2)
     near = np.trace(position, axis1=1, axis2=2) <= BIRTH_POSITION_STD_LIMIT**2
     which, mean, read, R, position = (a[near] for a in (which, mean, read, R, position))

@@ -314,7 +314,7 @@ def test_numbers_snr_and_references():
     none, and a number is used once. Planted bugs: the SNR of another detection or of the first one
     for ever; references tracked as reflectors."""
     seen, still = one_detection()
-    tracker = Tracker(Tracking(), Ambiguity(PERIOD))
+    tracker = Tracker(Tracking(), Ambiguity())
     z = np.column_stack([seen.range, seen.velocity, seen.direction])
     others = np.concatenate([z + np.array([7.0, 0, 0, 0]), z, z - np.array([9.0, 0, 0, 0])])
     for k in range(3):

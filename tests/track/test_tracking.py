@@ -367,7 +367,7 @@ def test_birth_confirmation_and_death():
     """Confirmed at the third hit, dropped after eight misses, a new id afterwards; a single false
     alarm lives until it can no longer reach 3 of 5. Planted bug: misses not reset by a hit."""
     settings = Tracking()
-    tracker = Tracker(settings, Ambiguity(PERIOD))
+    tracker = Tracker(settings, Ambiguity())
     hidden = {6, 7, 8} | set(range(12, 20))
     seen = {
         k: (tracks.ids.tolist(), tracks.confirmed.tolist())
@@ -377,9 +377,29 @@ def test_birth_confirmation_and_death():
     assert seen[8] == ([0], [True]) and seen[18] == ([0], [True])
     assert seen[19] == ([], [])
     assert seen[20] == ([1], [False]) and seen[22] == ([1], [True])
-    alone = Tracker(settings, Ambiguity(PERIOD))
+    alone = Tracker(settings, Ambiguity())
     lives = [len(tracks) for _, _, tracks in fly(alone, 6, [BODY], 0.02, 2, set(range(1, 6)))]
     assert lives == [1, 1, 1, 0, 0, 0]
+
+
+def test_a_folded_velocity_starts_a_track_in_both_readings():
+    """A body that recedes by 0.7 of the period, in the world too: after three frames one track is
+    confirmed, at its velocity, and the other reading ends. Planted bugs: the reading nearest to
+    standing still alone; the range of the second one kept."""
+    fold = Ambiguity(PERIOD, 0.217)
+    body = np.concatenate([BODY[:3], OWN.velocity])
+    away = measure(body, OWN)[0]
+    body[3:] += 0.7 * PERIOD * (body[:3] - OWN.position) / away
+    tracker = Tracker(Tracking(), fold)
+    for k in range(6):
+        now = replace(OWN, position=OWN.position + 0.02 * k * OWN.velocity)
+        z = measure(body + np.concatenate([0.02 * k * body[3:], np.zeros(3)]), now)
+        tracker.predict(0.02 * k)
+        tracker.update(detections(z + [-fold.shift, -fold.period, 0, 0]), now)
+        if k == 0:
+            assert sorted(t.detection for t in tracker.tracks) == [0, 0]
+    assert [t.confirmed for t in tracker.tracks] == [True]
+    assert tracker.snapshot(now).velocity[0] == pytest.approx(0.7 * PERIOD, abs=0.1)
 
 
 def test_prediction_lists_reference_then_confirmed_reflectors():
@@ -438,7 +458,7 @@ def test_ids_are_deterministic():
 def test_a_track_says_which_detection_updated_it():
     """Rows of the frame's detections, whatever their order; -1 while it coasts. Planted bugs: the
     row kept while coasting, the row among the detections that no confirmed track took."""
-    tracker = Tracker(Tracking(), Ambiguity(PERIOD))
+    tracker = Tracker(Tracking(), Ambiguity())
     far = BODY + np.array([17.0, 9.0, 1.0, 1.0, -2.0, 0.0])
     expected_rows = ([0, 1], [1, 0], [0, 1], [1, 0], [-1, 0], [-1, -1])
     for k, rows in enumerate(expected_rows):
