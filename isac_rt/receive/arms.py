@@ -60,18 +60,6 @@ def all_channels(antennas: Antennas) -> Channels:
     return Channels(t, r, a.tx_positions[t] + a.rx_positions[r])
 
 
-@lru_cache(maxsize=32)
-def both_arms(antennas: Antennas) -> Channels:
-    """Both arms of the virtual L of an echo; their common corner once."""
-    x, z = arm(antennas, 0), arm(antennas, 2)
-    new = ~np.isin(z.tx * antennas.num_rx + z.rx, x.tx * antennas.num_rx + x.rx)
-    return Channels(
-        np.append(x.tx, z.tx[new]),
-        np.append(x.rx, z.rx[new]),
-        np.concatenate([x.places, z.places[new]]),
-    )
-
-
 def element_delays(
     positions: np.ndarray, direction: np.ndarray, radius: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

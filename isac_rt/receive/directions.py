@@ -31,7 +31,7 @@ from isac_rt.kernels import hermitian, receive_directions
 from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.receive_directions import Axis
 from isac_rt.kernels.vector import LANES
-from isac_rt.receive.arms import Channels, all_channels, both_arms
+from isac_rt.receive.arms import Channels, all_channels
 
 DIRECTIONS = 32
 """Values of each direction cosine that are searched; the peak between them is sought from there."""
@@ -166,13 +166,9 @@ def _sizes(values: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=8)
-def searches(antennas: Antennas, wavenumber: float) -> tuple[Search, Search]:
-    """The search over all channels, and over those of both arms."""
-    limit = antennas.view_limit
-    return (
-        Search.of(all_channels(antennas), wavenumber, limit),
-        Search.of(both_arms(antennas), wavenumber, limit),
-    )
+def channel_search(antennas: Antennas, wavenumber: float) -> Search:
+    """The search over all channels of an echo."""
+    return Search.of(all_channels(antennas), wavenumber, antennas.view_limit)
 
 
 @lru_cache(maxsize=8)
@@ -224,7 +220,7 @@ def search_plain(x: np.ndarray, search: Search, noise: float, least: float) -> F
     some = np.flatnonzero(peak >= least)
     y = np.ascontiguousarray(x[:, :, some].transpose(2, 0, 1))
     whole = np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32)
-    peak[some], cosines[some] = _on_grid(y, whole, search)
+    peak[some], cosines[some] = on_grid(y, whole, search)
     above = peak[some] >= least
     some = some[above]
     statistic = statistic_of(y[above], scale=scale)
@@ -260,7 +256,7 @@ def search_white(
     """
     inverse = inverses(R)
     y = np.matmul(x, inverse.transpose(0, 2, 1))
-    peak, cosines = _on_grid(y, 1 / denominators(inverse, search), search)
+    peak, cosines = on_grid(y, 1 / denominators(inverse, search), search)
     some = np.flatnonzero(peak >= least)
     statistic = statistic_of(y[some], inverse[some])
     peak[some], cosines[some] = climbed(statistic, cosines[some], search)
@@ -383,7 +379,7 @@ def quadratic_forms(
     out[:] = np.maximum(forms.real, 1e-6)
 
 
-def _on_grid(y: np.ndarray, scale: np.ndarray, search: Search) -> tuple[np.ndarray, np.ndarray]:
+def on_grid(y: np.ndarray, scale: np.ndarray, search: Search) -> tuple[np.ndarray, np.ndarray]:
     """Largest sum of |a^H y|^2 over the looks of y (S, T, L) times a scale (S or 1, G, G), and its
     direction, interpolated."""
     peak, place = np.zeros(len(y), np.float32), np.zeros((len(y), 2), np.float32)

@@ -13,7 +13,6 @@ from isac_rt.settings import Node, Problem
 COUNTS_WITH = {
     "velocity_method": ("clutter_detector", ("cfar",)),
     "update_false_alarm_rate": ("clutter_detector", ("angle_doppler",)),
-    "gate_false_alarm_rate": ("clutter_detector", ("angle_doppler",)),
 }
 """Keys of `receivers` that play a part only with some values of another key."""
 
@@ -26,6 +25,7 @@ class Receivers(Node):
         "cluster_cells": "leave it out: a detection is the strongest of its neighbours",
         "clutter_run_cells": "leave it out: a run counts as clutter from 15 cells on",
         "clutter_channels": "leave it out; clutter_detector: angle_doppler filters all antennas",
+        "gate_false_alarm_rate": "leave it out: update_false_alarm_rate carries tracks on",
         "clutter_detector: map": "clutter_detector: angle_doppler, which uses the same mesh",
         "clutter_detector: sample_matrix": "clutter_detector: angle_doppler in a city, else cfar",
         "symbol_decision: profile": "symbol_decision: beams, which is the most sensitive",
@@ -59,10 +59,6 @@ class Receivers(Node):
     """Probability that noise alone is taken in one cell for a detection that may carry on a track,
     for `clutter_detector: angle_doppler`; those by `false_alarm_rate`, which is at most as high,
     may start one too. null, the default: the same rate."""
-    gate_false_alarm_rate: Annotated[float, Field(gt=0, lt=0.1)] | None = None
-    """False alarm rate of a whole gate in which a track or, with `cooperation`, a report expects a
-    UAV, for `clutter_detector: angle_doppler`. Such detections update tracks and start none. null,
-    the default: no separate threshold."""
     guard_cells: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (3, 3)
     """Cells in range and Doppler on each side of a cell that its background excludes, so that a
     target does not raise its own threshold. The default covers the main lobe of the Hann window."""
@@ -122,12 +118,6 @@ class Receivers(Node):
     def false_alarm_rates(self) -> tuple[float, float]:
         """False alarm rates of a detection, and of one that may start a track."""
         return self.update_false_alarm_rate or self.false_alarm_rate, self.false_alarm_rate
-
-    @property
-    def gate_rate(self) -> float:
-        """False alarm rate of a detection in the gate of an expected UAV; that of any other cell
-        where the gate has none of its own."""
-        return self.gate_false_alarm_rate or self.false_alarm_rates[0]
 
     @property
     def needs_mesh(self) -> bool:

@@ -307,20 +307,6 @@ class Reception:
 
 
 @dataclass(frozen=True)
-class Gates:
-    """Where K UAVs are expected, by their tracks or by what they say of themselves.
-
-    Attributes
-    ----------
-    mean : (K, 4) range, velocity and direction cosines as in `Detections`
-    std : (K, 4) standard deviations
-    """
-
-    mean: np.ndarray
-    std: np.ndarray
-
-
-@dataclass(frozen=True)
 class ExpectedClutter:
     """K independent scatterers of known mean power, as one receiver expects them at the middle of a
     frame.
@@ -387,11 +373,9 @@ class Hints:
     Attributes
     ----------
     clutter : what its city returns; None: unknown
-    gates : where UAVs are; None: nowhere
     """
 
     clutter: ExpectedClutter | None = None
-    gates: Gates | None = None
 
 
 NO_HINTS = Hints()

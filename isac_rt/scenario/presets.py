@@ -20,7 +20,6 @@ PLAIN: dict[str, dict[str, Any]] = {
         "clutter_detector": "cfar",
         "false_alarm_rate": 1e-6,
         "update_false_alarm_rate": None,
-        "gate_false_alarm_rate": None,
     },
     "tracking": {"drop_after_s": None, "births": "all"},
 }
@@ -46,7 +45,6 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "passive_detector": "beams",
             "clutter_detector": "angle_doppler",
             "update_false_alarm_rate": 1e-4,
-            "gate_false_alarm_rate": 1e-3,
         },
         "tracking": {"drop_after_s": 0.36, "births": "unexplained"},
     },

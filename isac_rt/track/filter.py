@@ -355,7 +355,8 @@ def births(
     and the states (K, 9) after each.
 
     Of what the `ambiguity` leaves open the two readings nearest to standing still count, the
-    second ones after all first ones, unless they are faster than UAVs fly. The position from range and direction (front half-space), its covariance through the inverse
+    second ones after all first ones, unless they are faster than UAVs fly. The
+    position from range and direction (front half-space), its covariance through the inverse
     Jacobian; the velocity is zero in the world with `BIRTH_SPEED_STD` per axis, conditioned on the
     measured rate: the component along the line of sight (or the bisector) is then known, the others
     are not. The acceleration is zero with `acceleration_std` [m/s^2] per axis.

@@ -15,7 +15,7 @@ import numpy as np
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.plain import Stateful
-from isac_rt.receive.types import Detections, ExpectedClutter, Gates, Prediction, Reception
+from isac_rt.receive.types import Detections, ExpectedClutter, Prediction, Reception
 from isac_rt.track.filter import Gaussian
 from isac_rt.track.tracker import Track, Tracker
 from isac_rt.world.swarm import Pose
@@ -164,6 +164,9 @@ class OtherPaths(Stateful):
         """True if a path is known over which data are read."""
         return False
 
+    def take_over(self, reference: Prediction, own: Own) -> None:
+        """Go on over a reference that is no line of sight, row 0, from the next frame on."""
+
     def read_frame(
         self,
         cube: IFCube,
@@ -199,7 +202,6 @@ class Equipment:
     rules : for its tracks, in their order
     hardware : what it learns of its own boards and clock
     other_paths : a passive terminal's reading of data over other paths than the line of sight
-    expect_targets : where an active terminal expects tracks and other terminals; None: nowhere
     expect_clutter : what the mesh returns of a passive terminal's transmitter in a state (6,) at
         its own pose, both in world coordinates; None: unknown
     """
@@ -207,7 +209,6 @@ class Equipment:
     rules: Sequence[TrackRule] = ()
     hardware: HardwareModel = field(default_factory=HardwareModel)
     other_paths: OtherPaths = field(default_factory=OtherPaths)
-    expect_targets: Callable[[Tracker, Own], Gates] | None = None
     expect_clutter: Callable[[np.ndarray, Pose], ExpectedClutter] | None = None
 
     @property

@@ -29,6 +29,7 @@ from isac_rt.track.filter import (
     update,
     wrapped,
 )
+from isac_rt.track.parts import Own
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import Track, Tracker, in_plane
 from isac_rt.world.swarm import Pose
@@ -59,6 +60,9 @@ leave."""
 COAST_CELLS = 0.2
 """A prediction whose range is known worse than this many cells cannot read the fraction of a
 cell."""
+PLACE_CELLS = 3.0
+"""A reference whose length is farther than this from where the transmitter reports to be [cells] is
+another path: two paths in the cell of the line of sight pull it by one, clocks by less."""
 
 
 class TerminalState(IntEnum):
@@ -81,6 +85,7 @@ class Followed:
     read : whether the last data frame was read
     slips_repaired : times that the range was moved by whole cells while data flowed
     ends : symbols at and beyond the alphabet's ends, by frame, the newest last
+    report : the transmitter as its data reported it last; None: they never did
     """
 
     track: Track | None = None
@@ -89,6 +94,7 @@ class Followed:
     read: bool = False
     slips_repaired: int = 0
     ends: list[np.ndarray] = field(default_factory=list)
+    report: Track | None = None
 
 
 class Reference(Stateful):
@@ -122,16 +128,24 @@ class Reference(Stateful):
 
     def predict(self, time: float) -> None:
         """Bring the track to a time [s]."""
-        if self.track is not None:
-            interval = time - self.state.time
-            self.track.state = predict(self.track.state, interval, self._acceleration_std)
-            self.track.age += 1
-            self.track.detection = -1
+        for track in (self.track, self.state.report):
+            if track is not None:
+                interval = time - self.state.time
+                track.state = predict(track.state, interval, self._acceleration_std)
+                track.age += 1
+                track.detection = -1
         self.state.time = time
 
     def reported(self, state: Gaussian) -> Track:
         """Return the transmitter as its data report it (6,), as a track."""
-        return Track.of_body(state, self._acceleration_std, self.state.time)
+        self.state.report = Track.of_body(state, self._acceleration_std, self.state.time)
+        return self.state.report
+
+    def forget(self, tracker: Tracker) -> None:
+        """End the track, and the others that rested on it: it was another path's."""
+        if self.track is not None:
+            self.state.track, self.state.ends = None, []
+            tracker.clear()
 
     def prediction(self, tracker: Tracker, own: Pose) -> Prediction | None:
         """Return what is expected of a data frame; None when the range is no longer known well
@@ -141,12 +155,22 @@ class Reference(Stateful):
         prediction = tracker.to_prediction(own, self.track)
         return prediction if prediction.range_std[0] < COAST_CELLS * self.cells[0] else None
 
-    def is_plausible(self, reception: Reception) -> bool:
-        """Return whether the reference found is as strong as a line of sight of its length:
-        transmit power and antennas are public."""
+    def is_plausible(self, reception: Reception, own: Own) -> bool:
+        """Return whether the reference found is as strong as a line of sight of its length, as
+        transmit power and antennas are public, and as long as the place says that it
+        reports."""
         d = reception.detections
-        scaled = reception.reference_power * d.range[d.is_reference][0] ** 2
-        return bool(scaled >= self._level / LEVEL_DROP)
+        length = d.range[d.is_reference][0]
+        strong = reception.reference_power * length**2 >= self._level / LEVEL_DROP
+        return bool(strong) and self.is_near(length, own)
+
+    def is_near(self, length: float, own: Own) -> bool:
+        """Return whether a path is as long [m] as the straight one from where the transmitter
+        reports to be; also where it does not report."""
+        if own.sender is None:
+            return True
+        straight = np.linalg.norm(own.sender.state.mean[:3] - own.pose.position)
+        return bool(abs(length - straight) <= PLACE_CELLS * self.cells[0])
 
     def update(self, reception: Reception, own: Pose, tracker: Tracker, anchored: bool) -> None:
         """Update the track by a frame, or restart it, and say where the terminal stands. A frame

@@ -101,7 +101,7 @@ class ActiveTerminal(Stateful):
     >>> reception, tracks = terminal.step(
     ...     cube, sent.payload, sent.pose, time=frame.paths[link].epoch
     ... )
-    >>> len(tracks) == len(reception.detections)
+    >>> len(set(tracks.detection)) == len(reception.detections)
     True
     """
 
@@ -153,8 +153,7 @@ class ActiveTerminal(Stateful):
             clutter = before.apply(clutter)
         self.tracker.predict(time)
         own = Own(own_pose, time, reported_poses, reports)
-        expect = self.equipment.expect_targets
-        self._hints = Hints(clutter, None if expect is None else expect(self.tracker, own))
+        self._hints = Hints(clutter)
         reception = _reception(self.receive(cube, payload, clutter, maps))
         if reception.correction is not None:
             before = before or Correction(0.0, np.zeros(3))
@@ -253,8 +252,9 @@ class PassiveTerminal(Stateful):
         self.tracker.predict(time)
         own = self._own(Own(own_pose, time, reported_poses, reports, sender is not None), sender)
         self._hints = Hints(own.clutter)
+        self._hand_over(own)
         reception = self._read(cube, own, modulated, maps)
-        refused = reception.line_of_sight and not self.reference.is_plausible(reception)
+        refused = reception.line_of_sight and not self.reference.is_plausible(reception, own)
         if refused:
             reception = reception.without_reference()
         reception, anchored = self.equipment.other_paths.read_frame(
@@ -270,7 +270,7 @@ class PassiveTerminal(Stateful):
             self.reference.state.read = reception.decoded
         self.reference.update(reception, own_pose, self.tracker, anchored)
         self._track(reception, own)
-        tracks = self.tracker.snapshot(own_pose, self.reference.track)
+        tracks = self._snapshot(own_pose)
         self.equipment.hardware.learn_from(reception, own, self.tracker, self.reference.track)
         return reception, tracks
 
@@ -293,6 +293,23 @@ class PassiveTerminal(Stateful):
             clutter, delay=clutter.delay + delay, delay_rate=clutter.delay_rate + rate
         )
         return replace(own, clutter=clutter)
+
+    def _hand_over(self, own: Own) -> None:
+        """Go on over the reference as over another path where it is not as long as the straight one
+        from where the transmitter reports to be."""
+        track = self.reference.track
+        if track is None or own.sender is None:
+            return
+        path = self.tracker.to_prediction(own.pose, track)
+        if not self.reference.is_near(path.range[0], own):
+            self.equipment.other_paths.take_over(path, own)
+            self.reference.forget(self.tracker)
+
+    def _snapshot(self, own: Pose) -> TrackSet:
+        """Return the tracks, relative to the transmitter as it is tracked, else as it reported."""
+        track, report = self.reference.track, self.reference.state.report
+        tracks = self.tracker.snapshot(own, track or report)
+        return tracks if track is not None else tracks.select(~tracks.is_reference)
 
     def _read(self, cube: IFCube, own: Own, modulated: bool, maps: bool) -> Reception:
         """Receive a frame; where symbols outside the alphabet show a slip, move the reference by

@@ -124,6 +124,7 @@ class TrackSet:
     age : (K,) int, frames since the first detection
     confirmed, is_reference : (K,) bool; the reference is a PT's track of its AT
     detection : (K,) int, row among the frame's detections that updated it, -1: none
+    snr : (K,) of the last detection, infinite where others report a body
     """
 
     ids: np.ndarray
@@ -137,9 +138,14 @@ class TrackSet:
     confirmed: np.ndarray
     is_reference: np.ndarray
     detection: np.ndarray
+    snr: np.ndarray
 
     def __len__(self) -> int:
         return self.ids.shape[0]
+
+    def select(self, which: np.ndarray) -> TrackSet:
+        """The tracks that a mask or an index array chooses."""
+        return TrackSet(**{name: of[which] for name, of in vars(self).items()})
 
     @property
     def measured(self) -> np.ndarray:
@@ -199,6 +205,7 @@ def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None
         confirmed=np.array([t.confirmed for t in everyone], bool),
         is_reference=is_reference,
         detection=np.array([t.detection for t in everyone], np.int64),
+        snr=np.array([t.snr for t in everyone], float),
     )
 
 

@@ -26,7 +26,7 @@ from isac_rt.propagation.clutter import cells as clutter_cells
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.scatter_paths import LinkState
-from isac_rt.receive.directions import searches
+from isac_rt.receive.directions import channel_search
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import ExpectedClutter
 from isac_rt.simulation.setup import propagation_in, swarm_of
@@ -557,7 +557,7 @@ def test_what_a_terminal_expects_of_a_wall_whitens_any_other_draw_of_it():
     antennas = antennas_of(scenario.Array(), w)
     turns = conventional_schedule(antennas.num_tx, w.num_chirps, antennas.num_tx)
     known = Known.unmodulated(w, turns, antennas, 2)
-    search = searches(antennas, known.wavenumber)[0]
+    search = channel_search(antennas, known.wavenumber)
     held = np.fft.ifftshift(expected_power(truth, known, 120), axes=1)
     noise = held.max() / 10**2.7
     cells = [part[:440] for part in np.nonzero(held > 50 * noise)]

@@ -131,6 +131,7 @@ def track_set(receiver: str, frame: int, rows) -> TrackSet:
         confirmed=np.array([row[1] for row in rows], bool),
         is_reference=np.zeros(count, bool),
         detection=np.array([row[2] for row in rows], int),
+        snr=np.ones(count),
     )
 
 

@@ -15,19 +15,15 @@ from receiver_cubes import ANTENNAS, Path, cube
 
 from isac_rt.extensions.city_receivers.standard import (
     active_terminal,
-    expected_targets,
     passive_terminal,
 )
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
-from isac_rt.track.filter import Gaussian
-from isac_rt.track.parts import Own, ReportedUav, of_itself
 from isac_rt.track.reference import TerminalState
 from isac_rt.track.settings import Tracking
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
-from isac_rt.track.tracker import Track
 from isac_rt.world.swarm import Pose, attitude
 
 W = Waveform(num_samples=256, num_chirps=36)
@@ -200,26 +196,3 @@ def test_a_capture_is_all_that_a_terminal_needs(tmp_path, active):
         assert sorted(found.files) == sorted(expected)
         for name, value in expected.items():
             assert np.array_equal(found[name], value, equal_nan=value.dtype.kind == "f"), name
-
-
-def test_the_active_terminal_expects_its_tracks_and_its_mates_where_they_are():
-    """A mate 20 m ahead that recedes at 3 m/s, as it said, and the track of an echo, straight ahead
-    too, one frame later. By hand: twice 0.05 m and 0.05 m/s in squares; none of what stands still
-    or is no terminal, nor where it is not asked for.
-    Planted bugs: gates of the frame before; one of every body that it was told of."""
-    rule = Receivers(clutter_detector="angle_doppler", gate_false_alarm_rate=1e-3)
-    at = active_terminal(W, ANTENNAS, rule, Tracking())
-    own = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
-    mate = replace(own, position=np.array([0.0, 20.0, 0.0]), velocity=np.array([0.0, 3.0, 0.0]))
-    body = Gaussian(np.array([0.0, 30.0, 0, 0, -4.0, 0, 0, 0, 0]), 0.01 * np.eye(9))
-    still = Gaussian(np.array([0.0, 15.0, 0, 0, 0.1, 0, 0, 0, 0]), 0.01 * np.eye(9))
-    at.tracker.state.tracks = [Track(0, body, 10.0), Track(1, still, 10.0)]
-    at.tracker.state.time = 0.0
-    at.tracker.predict(0.5)
-    reports = [ReportedUav("PT", of_itself(mate)), ReportedUav("", of_itself(own))]
-    assert at.equipment.expect_targets is expected_targets
-    sought = expected_targets(at.tracker, Own(own, 0.5, reports=reports))
-    np.testing.assert_allclose(sought.mean, [[28, -4, 0, 0], [20, 3, 0, 0]], atol=1e-9)
-    np.testing.assert_allclose(sought.std[1, :2], 0.05 * np.sqrt(2))
-    plain = active_terminal(W, ANTENNAS, Receivers(clutter_detector="angle_doppler"), Tracking())
-    assert plain.equipment.expect_targets is None

@@ -395,7 +395,7 @@ def test_a_folded_velocity_starts_a_track_in_both_readings():
         now = replace(OWN, position=OWN.position + 0.02 * k * OWN.velocity)
         z = measure(body + np.concatenate([0.02 * k * body[3:], np.zeros(3)]), now)
         tracker.predict(0.02 * k)
-        tracker.update(detections(z + [-fold.shift, -fold.period, 0, 0]), now)
+        tracker.update(detections(z - np.array([fold.shift, fold.period, 0, 0])), now)
         if k == 0:
             assert sorted(t.detection for t in tracker.tracks) == [0, 0]
     assert [t.confirmed for t in tracker.tracks] == [True]

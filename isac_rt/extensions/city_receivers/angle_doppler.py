@@ -8,7 +8,7 @@ elsewhere. The estimates' beam is the plain one, so that clutter within a lobe s
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,10 +21,11 @@ from isac_rt.extensions.city_receivers.adaptive import (
 )
 from isac_rt.extensions.city_receivers.correction import fit
 from isac_rt.extensions.city_receivers.covariance import Bucketed
-from isac_rt.extensions.city_receivers.gates import Gate, gates_of, seek
 from isac_rt.extensions.city_receivers.neighbours import phases
 from isac_rt.extensions.city_receivers.power import TAPER, Taper, expected_power
-from isac_rt.receive.arms import all_channels, both_arms
+from isac_rt.extensions.city_receivers.waves import Wave, waves_of
+from isac_rt.frame.antennas import resolutions
+from isac_rt.receive.arms import all_channels
 from isac_rt.receive.cfar import (
     LOBE_MARGIN,
     first_row,
@@ -36,11 +37,11 @@ from isac_rt.receive.directions import (
     PRUNED,
     Found,
     Search,
+    channel_search,
     climbed,
     inverses,
     search_plain,
     search_white,
-    searches,
     statistic_of,
 )
 from isac_rt.receive.estimate import OFF_GRID, Estimate, Estimator, LocalSpectra
@@ -48,7 +49,7 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import UNION_FLOOR, accumulate, maps_with_power
 from isac_rt.receive.sense import Sensed, describe
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import NO_HINTS, Correction, ExpectedClutter, Gates, Hints
+from isac_rt.receive.types import NO_HINTS, Correction, Detections, ExpectedClutter, Hints
 
 QUIET = 0.3
 """Share of the cells, those with the least clutter to be expected, whose median power is taken for
@@ -57,6 +58,10 @@ TWO_WAVES = 0.5
 """Where no clutter is expected an echo starts no track if other waves in its cell have more than
 this share of its power: over a wall on one way alone two equal waves arrive. A wall that a UAV
 flies by adds less, in a canyon 0.1 to 0.2 of the UAV's echo."""
+
+
+MAIN_LOBE = 3.0
+"""Cells of the range and the velocity window's main lobe on each side, and one for migration."""
 
 
 @dataclass(frozen=True)
@@ -106,35 +111,61 @@ class AngleDoppler:
             correction = correct(power, known, clutter)
             clutter = correction.apply(clutter)
         hints = replace(hints, clutter=clutter)
-        judged = replace(self, fitted=False).test_cells([maps], known, hints)[0]
-        ratio, first = judged.ratio.copy(), first_row(self.settings, known.range_cell)
+        tested = replace(self, fitted=False).test_cells([maps], known, hints)[0]
+        ratio, first = tested.ratio.copy(), first_row(self.settings, known.range_cell)
         ratio[:first] = 0
         rows, bins = strongest_peaks(ratio, ratio > 1, self.settings, UNION_FLOOR)
-        cells = list(zip(rows.tolist(), bins.tolist(), strict=True))
-        found, direction = [], []
-        for (row, column), towards in zip(cells, judged.cosines[rows, bins], strict=True):
-            whitener = judged.whiteners.get((row, column))
-            beam = BeamSpectra(spectra, known, row, beam_weights(known, towards, whitener))
-            estimate = self.estimator.at(beam, ratio, row, column)
-            found.append(estimate)
-            if not self.estimator.on_grid:
-                towards = near_beam(estimate, known, towards, whitener)
-            direction.append(towards)
-        snr = np.maximum(power[rows, bins] / judged.level[rows, bins], ratio[rows, bins])
+        search = channel_search(known.antennas, known.wavenumber)
+        found, direction, cells, waves = [], [], [], []
+        for cell in zip(rows.tolist(), bins.tolist(), strict=True):
+            for wave in self._waves(maps, known, tested, cell):
+                beam = BeamSpectra(spectra, known, cell[0], on_antennas(wave.weights, known))
+                estimate = wave.alone(self.estimator.at(beam, ratio, *cell), search)
+                found.append(estimate)
+                towards = wave.cosines
+                if not self.estimator.on_grid:
+                    towards = near_beam(estimate, known, towards, wave.inverse)
+                direction.append(towards)
+                cells.append(cell)
+                waves.append((wave.share, wave.number))
+        rows, bins = np.array(cells, int).reshape(-1, 2).T
+        share, number = np.array(waves).reshape(-1, 2).T
+        snr = share * np.maximum(power[rows, bins] / tested.level[rows, bins], ratio[rows, bins])
         detections = describe(found, snr, known, on_grid=self.estimator.on_grid, mixed=TWO_WAVES)
+        detections = replace(detections, direction=np.array(direction).reshape(-1, 2))
         # where there is no clutter a UAV's echo is one wave
-        in_clutter = np.array([cell in judged.whiteners for cell in cells], bool)
-        starts = (judged.sure[rows, bins] > 1) & (detections.starts | in_clutter)
+        in_clutter = np.array([cell in tested.whiteners for cell in cells], bool)
+        starts = (share * tested.sure[rows, bins] > 1) & (detections.starts | in_clutter)
         if first:
             starts &= ~in_sidelobe(rows, bins, power, first)
-        directions = np.array(direction).reshape(-1, 2)
-        detections = replace(detections, direction=directions, starts=starts)
-        out = Sensed(found, detections, power, judged.level, correction=correction)
+        detections = replace(detections, starts=starts)
+        starts = starts & ~over_walls(detections, np.column_stack([rows, bins]), known)
+        kept = np.flatnonzero((number == 0) | ~repeated(detections, known))
+        detections = replace(detections, starts=starts).select(kept)
+        found = [found[i] for i in kept]
+        out = Sensed(found, detections, power, tested.level, correction=correction)
         if clutter is None or self.settings.self_calibration != "positions":
             return out
         expected = expected_power(clutter, known, len(power), self.taper)
         noise = noise_level(power, expected, known.channels)
         return replace(out, neighbours=phases(maps, expected, noise, known, clutter))
+
+    def _waves(
+        self, maps: np.ndarray, known: Known, tested: Tested, cell: tuple[int, int]
+    ) -> list[Wave]:
+        """Return the waves of a cell in which something was found."""
+        search, (row, column), bins = (
+            channel_search(known.antennas, known.wavenumber),
+            cell,
+            maps.shape[3],
+        )
+        inverse = tested.whiteners.get(cell)
+        if inverse is None:
+            inverse = np.eye(len(search.channels), dtype=np.complex64)
+        c = search.channels
+        x = maps[c.tx, c.rx, row, (column + bins // 2) % bins]
+        ratio = float(tested.ratio[cell])
+        return waves_of(x, inverse, tested.cosines[cell], search, ratio)
 
     def test_cells(self, frames: Sequence[np.ndarray], known: Known, hints: Hints) -> list[Tested]:
         """The verdict on frames that share their data and what is expected of them.
@@ -143,8 +174,7 @@ class AngleDoppler:
         ----------
         frames : (L_tx, L_rx, rows, P) complex64 of `channel_maps` each
         known : Known
-        hints : the expected clutter, and gates, which have thresholds of their own
-            (`isac_rt.extensions.city_receivers.gates`)
+        hints : the expected clutter
 
         Raises
         ------
@@ -184,42 +214,28 @@ class AngleDoppler:
         hints: Hints,
     ) -> Tested:
         assert hints.clutter is not None  # `expectation` has it
-        everything, arms = searches(known.antennas, known.wavenumber)
-        limits = self._limits(everything, known), self._limits(arms, known)
+        search = channel_search(known.antennas, known.wavenumber)
+        limits = self._limits(search, known)
         x = maps.reshape(1, -1, power.size)  # an echo has one look, all channels
-        plain = search_plain(x, everything, noise, PRUNED * limits[0][0])
+        plain = search_plain(x, search, noise, PRUNED * limits[0])
         ratio, sure = np.zeros((2, power.size), np.float32)
         cosines = np.full((power.size, 2), np.nan)
 
-        def note(found: Found, limit: tuple[float, float]) -> None:
-            ratio[found.cell], sure[found.cell] = found.peak / limit[0], found.peak / limit[1]
+        def note(found: Found) -> None:
+            ratio[found.cell], sure[found.cell] = (found.peak / limit for limit in limits)
             cosines[found.cell] = found.cosines
 
-        note(plain, limits[0])
+        note(plain)
         filled = np.fft.ifftshift(expected, axes=1).ravel() > LEAST_CLUTTER * noise
-        cell = plain.cell[filled[plain.cell] & (plain.peak > PRUNED * limits[1][0])]
-        bucketed = Bucketed.of(hints.clutter, known, everything, noise, self.taper)
-
-        def received(cell: np.ndarray, search: Search) -> np.ndarray:
-            c = search.channels
-            x = maps.reshape(*maps.shape[:2], -1)[c.tx[:, None], c.rx[:, None], cell]
-            return np.ascontiguousarray(x.T)[:, None] / np.float32(np.sqrt(noise))
-
-        R = bucketed.among(arms_of(known)).covariances(*np.divmod(cell, power.shape[1]))
-        found, _ = search_white(received(cell, arms), R, cell, arms)
-        note(found, limits[1])
-        # the few that remain with all channels: fewer directions look alike
-        cell = cell[found.peak > PRUNED * limits[1][0]]
-        R = bucketed.covariances(*np.divmod(cell, power.shape[1]))
-        note(search_white(received(cell, everything), R, cell, everything)[0], limits[0])
-        inverse = dict(zip(cell.tolist(), inverses(R), strict=True))
-        for gate in _gates(hints.gates, known, len(power), ratio, cosines):
-            quiet = not filled[gate.cell].any()
-            whiten = None if quiet else bucketed.covariances(*np.divmod(gate.cell, power.shape[1]))
-            found = seek(gate, received(gate.cell, everything), whiten, everything)
-            limit = gate.threshold(everything, self.settings.gate_rate)
-            if found.peak[0] > limit:
-                ratio[found.cell], cosines[found.cell] = found.peak / limit, found.cosines
+        cell = plain.cell[filled[plain.cell] & (plain.peak > PRUNED * limits[0])]
+        R = Bucketed.of(hints.clutter, known, search, noise, self.taper).covariances(
+            *np.divmod(cell, power.shape[1])
+        )
+        seen = np.ascontiguousarray(x[0, :, cell])[:, None] / np.float32(np.sqrt(noise))
+        found, _ = search_white(seen, R, cell, search)
+        note(found)
+        above = found.peak > limits[0]
+        inverse = dict(zip(cell[above].tolist(), inverses(R[above]), strict=True))
         rows, bins = power.shape
         shown = [
             np.fft.fftshift(a.reshape(rows, bins, *a.shape[1:]), axes=1)
@@ -238,17 +254,6 @@ class AngleDoppler:
         return field_threshold(*size, 1, usual), field_threshold(*size, 1, sure)
 
 
-def _gates(
-    expected: Gates | None, known: Known, rows: int, ratio: np.ndarray, cosines: np.ndarray
-) -> Iterator[Gate]:
-    """Gates in which nothing was found yet, but for cells that hold something from elsewhere: what
-    it leaves in other directions is no noise."""
-    for gate in () if expected is None else gates_of(expected, known, rows):
-        full = ratio[gate.cell] > 1
-        if not full.all() and not (gate.holds(cosines[gate.cell]) & full).any():
-            yield replace(gate, cell=gate.cell[~full])
-
-
 class BeamSpectra(LocalSpectra):
     """The rows around a peak, of which only one beam's power counts."""
 
@@ -256,31 +261,21 @@ class BeamSpectra(LocalSpectra):
         super().__init__(spectra, known, row, beam=weights.conj(), in_phase=True)
 
 
-def beam_weights(
-    known: Known, cosines: np.ndarray, whitener: np.ndarray | None = None
-) -> np.ndarray:
-    """(L_tx, L_rx) weights towards (u_x, u_z): of the virtual L, zero off it, or of all channels
-    against the clutter by R^-1 (L, L)."""
-    channels = both_arms(known.antennas) if whitener is None else all_channels(known.antennas)
-    out = np.zeros((known.antennas.num_tx, known.antennas.num_rx), complex)
-    towards = np.array([[cosines[0], 0.0, cosines[1]]])
-    steering = channels.steering(towards, known)[0]
-    out[channels.tx, channels.rx] = steering if whitener is None else whitener @ steering
+def on_antennas(values: np.ndarray, known: Known) -> np.ndarray:
+    """(L_tx, L_rx) of what all channels of an echo have (L,)."""
+    channels, antennas = all_channels(known.antennas), known.antennas
+    out = np.zeros((antennas.num_tx, antennas.num_rx), complex)
+    out[channels.tx, channels.rx] = values
     return out
 
 
 def near_beam(
-    estimate: Estimate, known: Known, cosines: np.ndarray, whitener: np.ndarray | None = None
+    estimate: Estimate, known: Known, cosines: np.ndarray, inverse: np.ndarray
 ) -> np.ndarray:
-    """(u_x, u_z) near the filter's beam of the most power of the virtual L, or of the largest
-    likelihood of all channels with R^-1 (L, L)."""
-    everything, arms = searches(known.antennas, known.wavenumber)
-    search = arms if whitener is None else everything
+    """(u_x, u_z) near the filter's beam of the largest likelihood with R^-1 (L, L)."""
+    search = channel_search(known.antennas, known.wavenumber)
     y = estimate.channels[search.channels.tx, search.channels.rx][None, None]
-    if whitener is None:
-        statistic = statistic_of(y)
-    else:
-        statistic = statistic_of(y @ whitener.T, whitener[None])
+    statistic = statistic_of(y @ inverse.T, inverse[None])
     best = climbed(statistic, cosines[None], search, FINE, 2)[1][0]
     period = 2 * np.pi / (known.wavenumber * known.antennas.spacing)
     best = best - period * np.round(best / period)
@@ -291,6 +286,34 @@ def correct(power: np.ndarray, known: Known, clutter: ExpectedClutter) -> Correc
     """Estimate from the frame the terminal's own velocity and the level that it expects."""
     expected = expected_power(clutter, known, len(power))
     return fit(power, noise_level(power, expected, known.channels), clutter, known)
+
+
+def over_walls(d: Detections, cells: np.ndarray, known: Known) -> np.ndarray:
+    """Mark waves (Q,) that share a cell (Q, 2) of which one comes from where a nearer and stronger
+    detection is that may start a track: an echo over a wall on one way arrives from its source
+    and from the wall."""
+    nearer = _off(d, known)[..., 0] > MAIN_LOBE
+    together = (cells[:, None] == cells).all(axis=2)
+    source = (together & (nearer & d.starts & _same_direction(d, known)).any(axis=1)).any(axis=1)
+    return np.asarray((together.sum(axis=1) > 1) & source)
+
+
+def repeated(d: Detections, known: Known) -> np.ndarray:
+    """Mark detections (Q,) in the main lobe of a stronger one from the same direction."""
+    beside = (np.abs(_off(d, known)[..., :2]) < MAIN_LOBE).all(axis=2)
+    return np.asarray((beside & _same_direction(d, known)).any(axis=1))
+
+
+def _off(d: Detections, known: Known) -> np.ndarray:
+    """(Q, Q, 4) by how many resolutions detections are off others."""
+    off = d.measured[:, None] - d.measured
+    return np.asarray(off / resolutions(known.waveform, known.antennas, known.passes))
+
+
+def _same_direction(d: Detections, known: Known) -> np.ndarray:
+    """(Q, Q) which detections come from where others are that are stronger."""
+    near = (np.abs(_off(d, known)[..., 2:]) < 0.5).all(axis=2)
+    return np.asarray(near & (d.snr > d.snr[:, None]))
 
 
 def in_sidelobe(rows: np.ndarray, bins: np.ndarray, power: np.ndarray, first: int) -> np.ndarray:
@@ -309,11 +332,3 @@ def noise_level(power: np.ndarray, expected: np.ndarray | None, looks: int) -> f
     """
     some = power if expected is None else power[expected <= np.quantile(expected, QUIET)]
     return float(np.median(some)) / (1 - 1 / (9 * looks)) ** 3
-
-
-def arms_of(known: Known) -> np.ndarray:
-    """Numbers of the channels of both arms among all."""
-    c, every = both_arms(known.antennas), all_channels(known.antennas)
-    pairs = zip(every.tx.tolist(), every.rx.tolist(), strict=True)
-    number = {pair: i for i, pair in enumerate(pairs)}
-    return np.array([number[pair] for pair in zip(c.tx.tolist(), c.rx.tolist(), strict=True)])

@@ -6,8 +6,8 @@ enough to make it suspect:
 
 - Is it one of the echoes that a nearer UAV must have over walls? There (straight) and back (over
   a wall), the reverse, or over a wall on both ways: their ranges, rates and directions follow from
-  the source's state and the wall's plane. An echo over a wall is always longer than the direct one,
-  and so weaker; being farther stands here for being weaker. The body is another track, or one that
+  the source's state and the wall's plane. An echo over a wall is longer than the direct one, and
+  so weaker by a factor that the lengths bound. The body is another track, or one that
   the terminal was told of: a UAV that the line of sight masks is received by its echoes over walls.
 - Does it lie behind a surface of the mesh? No UAV there could be seen straight.
 
@@ -24,6 +24,7 @@ import numpy as np
 from isac_rt.extensions.city_receivers.walls import Walls, lengths
 from isac_rt.frame.antennas import Antennas, resolutions
 from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.types import Detections
 from isac_rt.track.filter import Ambiguity, measure, wrapped
 from isac_rt.track.parts import Own, TrackRule
 from isac_rt.track.tracker import Track, Tracker, TrackSet, track_set
@@ -36,6 +37,12 @@ MEETING = 1e-9
 RESOLUTION_SHARE = 0.5
 """Share of the resolution that it may be off besides: echoes that share a cell pull each other's
 estimates."""
+ECHO_WAVES = 2.0
+"""Waves of equal power that an echo over a wall on one way consists of: out over the wall, and
+back."""
+ALIKE = 4.0
+"""Factor in power within which the waves of such an echo are found, and over the noise from which
+on both are."""
 ECHOED_FRAMES = 3
 """So many frames in a row a confirmed track fits a nearer UAV's echo, or lies behind a wall,
 before it ends: the UAV may be known only after its echo was confirmed, the place only then well
@@ -68,7 +75,12 @@ class Ghosts(TrackRule):
 
     def __init__(self, walls: Walls, leeway: Leeway) -> None:
         self._walls, self._leeway = walls, leeway
+        self._alone = np.zeros(0, bool)
         self.state = Echoed()
+
+    def births(self, detections: Detections, own: Own) -> Detections:
+        self._alone = alone(detections, self._leeway)
+        return detections
 
     def prune(self, tracker: Tracker, own: Own) -> None:
         """End the tracks, among those to be confirmed, that a wall explains, and of the others
@@ -87,7 +99,10 @@ class Ghosts(TrackRule):
         asked = np.isin(tracks.ids, [*(new | crossing)]) & ~tracks.is_reference
         reports = [Track.of_body(body.state) for body in own.reports]
         others = track_set(reports, own.pose, own.reference)
-        said = suspicion(tracks, own.pose, self._walls, self._leeway, others, asked)
+        single = (
+            (tracks.detection >= 0) & self._alone[tracks.detection] if self._alone.size else None
+        )
+        said = suspicion(tracks, own.pose, self._walls, self._leeway, others, asked, single)
         suspect = set(tracks.ids[said.suspect].tolist())
         before = self.state.frames
         self.state.frames = {k: before.get(k, 0) + 1 for k in sorted(suspect)}
@@ -167,6 +182,7 @@ def suspicion(
     leeway: Leeway,
     reported: TrackSet | None = None,
     asked: np.ndarray | None = None,
+    single: np.ndarray | None = None,
 ) -> Suspicion:
     """Hold the tracks of a terminal against the mesh.
 
@@ -180,6 +196,7 @@ def suspicion(
     reported : likewise, UAVs that other terminals report, with the same reference. Those not
         known to a resolution would explain anything, and are left out
     asked : (K,) bool, the tracks that may lie behind a wall; None: all but the reference
+    single : (K,) bool, those whose detection is `alone`; None: none
     """
     count = len(tracks)
     out = Suspicion(
@@ -214,15 +231,40 @@ def suspicion(
             continue
         std = np.hypot(tracks.std, known.std[s])
         may_be = ~tracks.is_reference & (tracks.range > known.range[s])
+        may_be &= tracks.snr <= ECHO_WAVES * known.snr[s] * _weaker(known, s, sender, tracks.range)
         if known is reported:  # a track of the UAV itself is no echo of it
             may_be &= ~leeway.explained(measured - reported.measured[s], std)
         faces, orders, ways = (np.array(of) for of in zip(*shown, strict=True))
         one_way = (orders == 1) & (sender is None)
         hit = leeway.explained(measured[:, None] - ways, std[:, None], one_way) & may_be[:, None]
+        if single is not None:
+            hit &= ~(single[:, None] & one_way)
         which, new = hit.argmax(axis=1), hit.any(axis=1) & (out.mirrored < 0)
         out.mirrored[new], out.order[new] = faces[which[new]], orders[which[new]]
         out.source[new] = known.ids[s]
     return out
+
+
+def alone(d: Detections, leeway: Leeway) -> np.ndarray:
+    """Return which detections (Q,) are too strong for an echo over a wall on one way without its
+    other wave, which comes from elsewhere."""
+    off = wrapped(d.measured[:, None] - d.measured, leeway.ambiguity)
+    near = np.abs(off) < leeway.resolution
+    other = near[..., :2].all(axis=2) & ~near[..., 2:].all(axis=2)
+    other &= ALIKE * d.snr > d.snr[:, None]
+    return np.asarray((d.snr > ALIKE) & ~other.any(axis=1))
+
+
+def _weaker(known: TrackSet, s: int, sender: np.ndarray | None, ranges: np.ndarray) -> np.ndarray:
+    """Return a bound on the power of echoes of body `s` over walls, of such ranges (K,), relative
+    to its direct one: no segment is shorter than the direct path's."""
+    back = float(np.linalg.norm(known.mean[s, :3]))
+    if known.is_reference[s]:
+        return (back / ranges) ** 2
+    out = back if sender is None else float(np.linalg.norm(known.mean[s, :3] - sender[:3]))
+    length = 2 * ranges if sender is None else ranges
+    longer = np.maximum(length - (out + back), 0.0)
+    return np.maximum(out / (out + longer), back / (back + longer)) ** 2
 
 
 def echoes(

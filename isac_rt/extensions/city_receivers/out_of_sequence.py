@@ -19,7 +19,7 @@ from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.passive import PassiveReceiver
-from isac_rt.receive.types import Detections, Hints, Reception
+from isac_rt.receive.types import Detections, Hints, Prediction, Reception
 from isac_rt.track.filter import measure
 from isac_rt.track.parts import Late, OtherPaths, Own, delayed
 from isac_rt.track.reference import COAST_CELLS, Reference
@@ -97,7 +97,7 @@ class OutOfSequence(OtherPaths):
         if out is None:
             return reception, False
         out = replace(out, detections=delayed(out.detections, own.clock, -1))
-        if out.line_of_sight and reference.is_plausible(out) and self._is_well_inside(out):
+        if out.line_of_sight and reference.is_plausible(out, own) and self._is_well_inside(out):
             self.forget()
             return out, True
         return out.without_sight(self._is_named(own)), False
@@ -145,6 +145,12 @@ class OutOfSequence(OtherPaths):
         """A frame without data, which tells the whole cells of those that wait."""
         if self.state.batch:
             self.state.path = self._learn(cube, time, False) or self.state.path
+
+    def take_over(self, reference: Prediction, own: Own) -> None:
+        p = delayed(reference, own.clock)
+        mean = np.array([p.range[0], p.velocity[0], 0.0])
+        spread = np.square([p.range_std[0], p.velocity_std[0], FIRST_BEND])
+        self.state.path = DataPath(own.time, mean, np.diag(spread), p.direction[0])
 
     def start(self, detections: Detections, time: float) -> None:
         """Go on over the strongest path of a frame without data whose reference is none."""

@@ -12,18 +12,17 @@ from isac_rt.extensions.city_receivers.ghosts import Ghosts, Leeway
 from isac_rt.extensions.city_receivers.images import Images
 from isac_rt.extensions.city_receivers.known_paths import LearnedHardware
 from isac_rt.extensions.city_receivers.out_of_sequence import OutOfSequence
-from isac_rt.extensions.city_receivers.static_clutter import StaticClutter, rests
+from isac_rt.extensions.city_receivers.static_clutter import StaticClutter
 from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import Detections, ExpectedClutter, Gates
+from isac_rt.receive.types import Detections, ExpectedClutter
 from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import Setup
-from isac_rt.track.filter import Gaussian, reported
 from isac_rt.track.parts import (
     Equipment,
     HardwareModel,
@@ -31,11 +30,10 @@ from isac_rt.track.parts import (
     Own,
     TrackRule,
     is_placed,
-    of_itself,
 )
 from isac_rt.track.settings import Tracking
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
-from isac_rt.track.tracker import Track, Tracker
+from isac_rt.track.tracker import Tracker
 from isac_rt.world.swarm import Pose
 
 REPORT_FRAMES = 5
@@ -138,11 +136,7 @@ def _active_equipment(
         if walls is None:
             raise ValueError("tracking.births unexplained needs the walls of a city")
         rules += _rules_of_walls(walls, antennas, waveform, 2)
-    return Equipment(
-        rules,
-        _hardware(receivers, waveform, antennas, 2),
-        expect_targets=expected_targets if receivers.gate_false_alarm_rate is not None else None,
-    )
+    return Equipment(rules, _hardware(receivers, waveform, antennas, 2))
 
 
 def _passive_equipment(
@@ -185,16 +179,3 @@ def _hardware(
     if receivers.self_calibration == "none":
         return HardwareModel()
     return LearnedHardware(waveform, antennas, passes)
-
-
-def expected_targets(tracker: Tracker, own: Own) -> Gates:
-    """Return where tracks that move, and other terminals by their reports, are expected. What is
-    static may be a wall that the mesh lacks, whose clutter nothing whitens."""
-    error = of_itself(own.pose).covariance
-    reported_poses = [
-        Track.of_body(Gaussian(body.state.mean, body.state.covariance + error)).state
-        for body in own.reports
-        if body.terminal
-    ]
-    moving = [t.state for t in tracker.tracks if not rests(t)]
-    return Gates(*reported(moving + reported_poses, own.pose))

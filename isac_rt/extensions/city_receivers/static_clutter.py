@@ -1,11 +1,11 @@
-"""Echoes that stand still: of a face of the terminal's mesh, or of a building that it lacks.
+"""Echoes of static surfaces that the terminal's mesh lacks.
 
-A UAV may hover, but not in a face: what stands still there, as far as is known of its place, is
-the wall, whose brightest spots pass the threshold that its mean return sets. It hovers alone, too,
-and in one place. What stands still in the world at several places near each other, and is explained
-by nothing that the terminal knows, is a surface. The terminal remembers such echoes for a while,
-because each frame shows other parts of it. Echoes of one surface are about as strong as each other:
-what stands far out of its neighbours is a UAV, and no neighbour of what is far weaker.
+What is static at several places near each other, and is explained by nothing that the terminal
+knows, is a surface, or a swarm that hovers or crosses. They differ in time: a surface shows other
+spots of itself in each frame, a UAV is found again where it was. The terminal follows such spots
+for a while, and those that are not found again make a surface of what is beside them. Echoes of
+one surface are about as strong as each other: what stands far out of its neighbours is a UAV, and
+no neighbour of what is far weaker.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import Ambiguity
 from isac_rt.track.parts import Own, TrackRule
-from isac_rt.track.tracker import Track, Tracker
+from isac_rt.track.tracker import Track, Tracker, assign
 from isac_rt.world.swarm import Pose
 
 STILL_MPS = 0.5
 """Off the rate of what stands still by no more than this, and three deviations, an echo may stand
 still [m/s]: the own velocity's error, and twice the spread of a wall within its cell."""
 MEMORY_S = 1.0
-"""How long an echo that stood still is remembered [s]."""
+"""How long a spot is remembered that is not found again [s]."""
 BESIDE_M = (1.5, 16.0)
-"""Echoes that far apart are beside each other [m]: not one and the same place, and not another
+"""Spots that far apart are beside each other [m]: not one and the same, and not another
 building's."""
 STANDS = 11.3
 """Squared distance of a velocity from nothing within which a track may stand still: 0.99 of chi
 squared of three."""
 CROWD = 3
-"""So many beside it make an echo part of a surface."""
-ON_FACE_M = 0.3
-"""Off a face by no more than this, and three deviations, what stands still may be the face [m]."""
+"""So many spots beside it that were not found again make an echo part of a surface."""
+FOUND_AGAIN = 0.5
+"""Share of the frames since its first one in which a UAV is found."""
 CLEAR_M = 0.5
 """No UAV flies nearer to a face than this [m]: its arms are as long. What is nearer, by two
 deviations, is an echo of something else over the wall."""
@@ -47,9 +47,11 @@ STANDS_OUT = 10.0
 
 @dataclass
 class Seen:
-    """Echoes that stood still lately: (n, 5) times, places and signal-to-noise ratios."""
+    """Spots that were static lately: (n, 7) places, signal-to-noise ratios, times of the last echo,
+    frames in which they were seen, and numbers of their first frame; and the frames so far."""
 
-    echoes: np.ndarray = field(default_factory=lambda: np.zeros((0, 5)))
+    spots: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
+    frames: int = 0
 
 
 class StaticClutter(TrackRule):
@@ -86,8 +88,8 @@ class StaticClutter(TrackRule):
         return replace(detections, starts=detections.starts & ~self._crowd)
 
     def prune(self, tracker: Tracker, own: Own) -> None:
-        """End the tracks that stand still within a crowd or on a face, and those, not confirmed
-        before, that an echo of either carries on: from beyond the view and along a wall they seem
+        """End the tracks that are static within a crowd, and those, not confirmed before, that
+        an echo of one carries on: from beyond the view and along a wall they seem
         to move."""
         fed = {t.id for t in tracker.tracks if t.detection >= 0 and self._crowd[t.detection]}
         still = {t.id for t in tracker.tracks if self.holds(t)}
@@ -110,7 +112,7 @@ class StaticClutter(TrackRule):
 
         Returns
         -------
-        (Q,) which of all detections stand still within a crowd or on a face
+        (Q,) which of all detections are static within a crowd
         """
         u = d.direction[:, None] + self._aliases
         far = np.linalg.norm(u, axis=-1)
@@ -125,56 +127,51 @@ class StaticClutter(TrackRule):
         across = speed * np.linalg.norm(d.std[:, 2:], axis=1)
         still = off[each, best] < STILL_MPS + 3 * np.hypot(d.std[:, 1], across)
         place = place[each, best]
-        spread = np.hypot(d.std[:, 0], d.range * d.std[:, 2:].max(axis=1, initial=0.0))
-        on = self._on_face(place, spread, still)
-        new = np.column_stack([np.full(len(d), time), place, d.snr])
-        new = new[still & d.starts & ~d.is_reference]
-        self.state.echoes = np.concatenate(
-            [self.state.echoes[self.state.echoes[:, 0] > time - MEMORY_S], new]
-        )
-        return on | still & self.crowded(place, d.snr)
+        self._note(place[some := still & d.starts & ~d.is_reference], d.snr[some], time)
+        return still & self.crowded(place, d.snr)
 
-    def _on_face(self, places: np.ndarray, spread: np.ndarray, asked: np.ndarray) -> np.ndarray:
-        """(n,) which of the places (n, 3) asked for, known to a deviation (n,), may lie on a face.
-        What is not known to `BESIDE_M` may lie on any, and is told by its crowd."""
-        reach = ON_FACE_M + 3 * spread
-        out = asked & (reach < BESIDE_M[0])
-        if self._walls is None:
-            return np.zeros(len(out), bool)
-        out[out] = [
-            self._walls.within(place, float(far))
-            for place, far in zip(places[out], reach[out], strict=True)
-        ]
-        return out
+    def _note(self, places: np.ndarray, snr: np.ndarray, time: float) -> None:
+        """Follow the spots to a frame's echoes (n, 3): each echo carries on the nearest one."""
+        state = self.state
+        old = state.spots[state.spots[:, 4] > time - MEMORY_S]
+        apart = np.linalg.norm(places[:, None] - old[None, :, :3], axis=-1)
+        pairs = assign(np.where(apart < BESIDE_M[0], apart, np.inf))
+        echo, spot = np.array(pairs, int).reshape(-1, 2).T
+        old[spot, :5] = np.column_stack([places, snr, np.full(len(snr), time)])[echo]
+        old[spot, 5] += 1
+        new = np.setdiff1d(np.arange(len(snr)), echo)
+        more = np.column_stack([places, snr, np.tile([time, 1, state.frames], (len(snr), 1))])[new]
+        state.spots, state.frames = np.concatenate([old, more]), state.frames + 1
 
     def crowded(self, places: np.ndarray, snr: np.ndarray) -> np.ndarray:
-        """(n,) whether what is seen at places (n, 3), so far above the noise (n,), lies among
-        echoes that stood still, and does not stand out of them. What touches the mesh does not:
+        """(n,) whether what is seen at places (n, 3), so far above the noise (n,), lies among spots
+        as strong of which most were not found again. What touches the mesh may stand out of them:
         the foot of a wall shines too."""
-        apart = np.linalg.norm(places[:, None] - self.state.echoes[None, :, 1:4], axis=-1)
+        spots = self.state.spots
+        fleeting = spots[:, 5] <= FOUND_AGAIN * (self.state.frames - spots[:, 6])
+        apart = np.linalg.norm(places[:, None] - spots[None, :, :3], axis=-1)
         beside = (apart > BESIDE_M[0]) & (apart < BESIDE_M[1])
-        beside &= self.state.echoes[:, 4] < STANDS_OUT * snr[:, None]
-        some = self._among(beside)
-        out = some & ~self._among(beside & (STANDS_OUT * self.state.echoes[:, 4] > snr[:, None]))
-        if self._walls is not None:
-            out[out] = [not self._walls.within(place, BESIDE_M[0]) for place in places[out]]
-        return some & ~out
+        beside &= spots[:, 3] < STANDS_OUT * snr[:, None]
+        like = beside & (STANDS_OUT * spots[:, 3] > snr[:, None])
 
-    def _among(self, beside: np.ndarray) -> np.ndarray:
-        """(n,) whether what is seen beside each (n, S) makes a crowd."""
-        some = beside.sum(axis=1) >= CROWD
-        some[some] = [_spots(self.state.echoes[near, 1:4]) >= CROWD for near in beside[some]]
-        return some
+        def is_surface(some: np.ndarray) -> np.ndarray:
+            count = (some & fleeting).sum(axis=1)
+            return np.asarray((count >= CROWD) & (2 * count > some.sum(axis=1)))
+
+        out = is_surface(like)
+        if self._walls is not None:
+            for i in np.flatnonzero(is_surface(beside) & ~out):
+                out[i] = self._walls.within(places[i], BESIDE_M[0])
+        return out
 
     def holds(self, track: Track) -> bool:
-        """Return whether a track is static, as far as is known of it, within a crowd or on a face,
-        or flies where no UAV can, in a face."""
+        """Return whether a track is static, as far as is known of it, within a crowd, or flies
+        where no UAV can, in a face."""
         place = track.state.mean[:3]
+        if rests(track):
+            return bool(self.crowded(place[None], np.array([track.snr]))[0])
         spread = float(np.sqrt(np.linalg.eigvalsh(track.state.covariance[:3, :3])[-1]))
-        if not rests(track):
-            return self._walls is not None and self._walls.within(place, CLEAR_M - 2 * spread)
-        on = self._on_face(place[None], np.array([spread]), np.ones(1, bool))
-        return bool(on[0] or self.crowded(place[None], np.array([track.snr]))[0])
+        return self._walls is not None and self._walls.within(place, CLEAR_M - 2 * spread)
 
 
 def rests(track: Track) -> bool:
@@ -182,18 +179,6 @@ def rests(track: Track) -> bool:
     velocity, P = track.state.mean[3:6], track.state.covariance[3:6, 3:6]
     d2 = velocity @ np.linalg.solve(P + STILL_MPS**2 * np.eye(3), velocity)
     return bool(d2 < STANDS)
-
-
-def _spots(places: np.ndarray) -> int:
-    """Count the places (n, 3) that are apart from each other, up to `CROWD`: a target that hovers
-    nearby is one, however often it was seen."""
-    spots: list[np.ndarray] = []
-    for place in places:
-        if all(np.linalg.norm(place - spot) > BESIDE_M[0] for spot in spots):
-            spots.append(place)
-        if len(spots) >= CROWD:
-            break
-    return len(spots)
 
 
 def _still(

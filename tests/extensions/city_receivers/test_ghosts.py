@@ -148,6 +148,25 @@ def test_ghosts_are_suspected_and_bodies_are_not():
     assert not alone.suspect.any()
 
 
+@pytest.mark.parametrize(("share", "mirrored"), [(0.95, True), (1.05, False)])
+def test_an_echo_over_a_wall_is_weaker_than_its_source(share, mirrored):
+    """The image of a UAV at 50 over the noise, as bright as two waves over one segment that is
+    longer by twice its range less the direct one: no more. Planted bugs: the power not asked; one
+    wave; the fourth power of the direct segment."""
+    body, own = BODY[:3], OWN.position - ORIGIN
+    image = body * [-1, 1, 1] + [2 * WALL_X, 0, 0]
+    near, far = (float(np.linalg.norm(p - own)) for p in (body, image))
+    brightest = 2 * 50.0 * (near / (2 * far - near)) ** 2
+    seen = track(5, image, BODY[3:] * [-1, 1, 1])
+    seen.snr = share * brightest
+    tracks = track_set([track(3, body, BODY[3:]), seen], OWN)
+    asked = np.zeros(2, bool)  # only of the image
+    found = suspicion(
+        tracks, OWN, Walls(wall()), Leeway(RESOLUTION, Ambiguity(PERIOD)), None, asked
+    )
+    assert (found.mirrored[1] >= 0) == mirrored
+
+
 def test_bodies_that_others_know_of_explain_echoes():
     """The body is masked: its image alone is tracked, and another terminal says where the body is.
     Told 2 m of doubt it explains nothing, and a track of the body is no echo of it though one more

@@ -9,7 +9,7 @@ from receiver_cubes import ANTENNAS, Path, cube, frame
 from test_images import ORIGIN, VELOCITY, WALL, city, pose
 
 from isac_rt.extensions.city_receivers.standard import Surroundings, passive_terminal
-from isac_rt.frame.payload import random_payload
+from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections
@@ -30,14 +30,14 @@ IMAGE = SENDER + np.array([2 * (11.3 - 3.7), 0.0, 0.0])
 speed."""
 
 
-def ways(n):
+def ways(n, echo=0.08):
     """The way over the wall and the target's echo, of a target that flies along."""
     moved = VELOCITY * n * INTERVAL
     mirrored = moved * [-1, 1, 1]
     out = []
     for place, motion, before, amplitude in (
         (IMAGE + mirrored, VELOCITY * [-1, 1, 1], 0.0, 0.5),
-        (TARGET + moved, VELOCITY, float(np.linalg.norm(TARGET - SENDER)), 0.08),
+        (TARGET + moved, VELOCITY, float(np.linalg.norm(TARGET - SENDER)), echo),
     ):
         span = place - OWN.position - moved
         e = span / np.linalg.norm(span)
@@ -83,6 +83,37 @@ def test_a_path_over_a_wall_is_named(said, named):
     # 0.1 cells of range, and a direction known to 0.01 at 10 m
     off = np.linalg.norm(tracks.mean[tracks.confirmed, :3] + own.position - TARGET - moved, axis=1)
     assert off.min() < 0.5
+    length = tracks.range[tracks.confirmed][off.argmin()]
+    assert length == pytest.approx(echo.length, abs=0.1 * W.range_cell(1))
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_reference_that_is_not_where_the_transmitter_is_becomes_a_path(told):
+    """Acquired by pilots, a wall's image stands in for the line of sight, as strong as one. Once
+    data are read that say where the transmitter is, it is read over as a path, and the target is
+    tracked where it is; nobody knows better where they say nothing. Planted bugs: the strength
+    alone asked; the tracks that rested on the image kept."""
+    _, schedule, _ = frame(waveform=W)
+    rng = np.random.default_rng(4)
+    free = ANTENNAS.gain * W.wavelength / (4 * np.pi * np.linalg.norm(IMAGE - OWN.position))
+    receivers = Receivers(link_acquisition="blind", symbol_decision="beams")
+    around = Surroundings(city(WALL))
+    terminal = passive_terminal(
+        W, ANTENNAS, receivers, Tracking(), 8, 0.5 / free, None, surroundings=around
+    )
+    for n in range(9):
+        payload = random_payload(W, schedule, 8, rng) if n > 1 else unmodulated(W)
+        received = cube(W, schedule, payload, ways(n, 0.04), noise=0.1, seed=n)
+        moved = VELOCITY * n * INTERVAL
+        own = Pose(OWN.position + moved, VELOCITY, np.zeros(3), OWN.rotation)
+        sender = Pose(SENDER + moved, VELOCITY, np.zeros(3), np.eye(3)) if told else None
+        heard, tracks = terminal.step(received, own, n * INTERVAL, n > 1, sender=sender)
+        assert heard.decoded == (n > 1)
+    assert np.array_equal(heard.bits, payload.bits)
+    assert (terminal.reference.track is None) == told and heard.line_of_sight != told
+    places = tracks.mean[tracks.confirmed & ~tracks.is_reference, :3]
+    off = np.linalg.norm(places + own.position - TARGET - moved, axis=1)
+    assert (off.min(initial=np.inf) < 0.5) == told
 
 
 class Asked(Exception):

@@ -311,6 +311,7 @@ def tracked(*rows, reference=None):
         confirmed=none == 0,
         is_reference=np.arange(len(rows)) == reference,
         detection=none.astype(int),
+        snr=none,
     )
 
 
