@@ -87,6 +87,13 @@ class Own:
         known = self.sender or self.reference
         return None if known is None else known.state
 
+    @property
+    def straight(self) -> float | None:
+        """Distance to where the transmitter reports to be [m]; None: it does not."""
+        if self.sender is None:
+            return None
+        return float(np.linalg.norm(self.sender.state.mean[:3] - self.pose.position))
+
 
 class TrackRule(Stateful):
     """A rule that keeps false tracks out; by itself it allows all."""

@@ -29,7 +29,6 @@ from isac_rt.track.filter import (
     update,
     wrapped,
 )
-from isac_rt.track.parts import Own
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import Track, Tracker, in_plane
 from isac_rt.world.swarm import Pose
@@ -155,22 +154,18 @@ class Reference(Stateful):
         prediction = tracker.to_prediction(own, self.track)
         return prediction if prediction.range_std[0] < COAST_CELLS * self.cells[0] else None
 
-    def is_plausible(self, reception: Reception, own: Own) -> bool:
+    def is_plausible(self, reception: Reception, straight: float | None) -> bool:
         """Return whether the reference found is as strong as a line of sight of its length, as
         transmit power and antennas are public, and as long as the place says that it
         reports."""
         d = reception.detections
         length = d.range[d.is_reference][0]
         strong = reception.reference_power * length**2 >= self._level / LEVEL_DROP
-        return bool(strong) and self.is_near(length, own)
+        return bool(strong) and self.is_near(length, straight)
 
-    def is_near(self, length: float, own: Own) -> bool:
-        """Return whether a path is as long [m] as the straight one from where the transmitter
-        reports to be; also where it does not report."""
-        if own.sender is None:
-            return True
-        straight = np.linalg.norm(own.sender.state.mean[:3] - own.pose.position)
-        return bool(abs(length - straight) <= PLACE_CELLS * self.cells[0])
+    def is_near(self, length: float, straight: float | None) -> bool:
+        """Return whether a path is as long [m] as the `straight` one, or that is unknown."""
+        return straight is None or bool(abs(length - straight) <= PLACE_CELLS * self.cells[0])
 
     def update(self, reception: Reception, own: Pose, tracker: Tracker, anchored: bool) -> None:
         """Update the track by a frame, or restart it, and say where the terminal stands. A frame

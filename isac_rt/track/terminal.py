@@ -254,7 +254,9 @@ class PassiveTerminal(Stateful):
         self._hints = Hints(own.clutter)
         self._hand_over(own)
         reception = self._read(cube, own, modulated, maps)
-        refused = reception.line_of_sight and not self.reference.is_plausible(reception, own)
+        refused = reception.line_of_sight and not self.reference.is_plausible(
+            reception, own.straight
+        )
         if refused:
             reception = reception.without_reference()
         reception, anchored = self.equipment.other_paths.read_frame(
@@ -297,18 +299,16 @@ class PassiveTerminal(Stateful):
     def _hand_over(self, own: Own) -> None:
         """Go on over the reference as over another path where it is not as long as the straight one
         from where the transmitter reports to be."""
-        track = self.reference.track
-        if track is None or own.sender is None:
-            return
-        path = self.tracker.to_prediction(own.pose, track)
-        if not self.reference.is_near(path.range[0], own):
-            self.equipment.other_paths.take_over(path, own)
-            self.reference.forget(self.tracker)
+        if self.reference.track is not None and own.sender is not None:
+            path = self.tracker.to_prediction(own.pose, self.reference.track)
+            if not self.reference.is_near(path.range[0], own.straight):
+                self.equipment.other_paths.take_over(path, own)
+                self.reference.forget(self.tracker)
 
     def _snapshot(self, own: Pose) -> TrackSet:
         """Return the tracks, relative to the transmitter as it is tracked, else as it reported."""
-        track, report = self.reference.track, self.reference.state.report
-        tracks = self.tracker.snapshot(own, track or report)
+        track = self.reference.track
+        tracks = self.tracker.snapshot(own, track or self.reference.state.report)
         return tracks if track is not None else tracks.select(~tracks.is_reference)
 
     def _read(self, cube: IFCube, own: Own, modulated: bool, maps: bool) -> Reception:

@@ -32,9 +32,6 @@ from isac_rt.world.swarm import Pose
 SURE_HITS = 2
 """With `tracking.births: unexplained` a track is confirmed if so many of its detections could have
 started it: others pass a lower threshold, which strong clutter passes again and again."""
-LEAST_APART = 0.5
-"""UAVs keep farther from each other than this [m]: two tracks of one terminal within it, and within
-their errors, are one; a picture parts them beyond twice this."""
 ROUNDING = 1e-9
 """Of sums of frame intervals [s]."""
 
@@ -153,32 +150,6 @@ class TrackSet:
         return np.column_stack([self.range, self.velocity, self.direction])
 
 
-def united(tracks: Sequence[Track]) -> list[Track]:
-    """Tracks, oldest first, of which no two confirmed ones are of one UAV.
-
-    Where a terminal's own errors part a track from its body's detections, these start another one,
-    and the two share them. One known to be within `LEAST_APART` of an older one goes, unless this
-    frame shows both; the older one goes on from where the UAV was seen last.
-    """
-    kept: list[Track] = []
-    for track in tracks:
-        twin = next((t for t in kept if _of_one_body(t, track)), None)
-        if twin is None:
-            kept.append(track)
-        elif track.last > twin.last:
-            seen = "state", "snr", "missed", "detection", "last"
-            vars(twin).update({name: vars(track)[name] for name in seen})
-    return kept
-
-
-def _of_one_body(a: Track, b: Track) -> bool:
-    if not (a.confirmed and b.confirmed) or min(a.detection, b.detection) >= 0:
-        return False
-    spread = max(np.diag(t.state.covariance)[:3].max() for t in (a, b))
-    apart = np.linalg.norm(a.state.mean[:3] - b.state.mean[:3])
-    return bool(apart < LEAST_APART and spread < LEAST_APART**2)
-
-
 def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None) -> TrackSet:
     """Report tracks relative to `own`; a PT's `reference` comes first and makes the others
     bistatic."""
@@ -288,8 +259,6 @@ class Tracker(Stateful):
                 track.last = self.state.time
         self._condition(hit, z, detections.std, own, transmitter)
         self.state.tracks = [t for t in self.tracks if not self._dead(t)]
-        if self.settings.births == "unexplained":
-            self.state.tracks = united(self.tracks)
         free = [q for q in free if detections.starts[q]]
         which, states = births(
             z[free],

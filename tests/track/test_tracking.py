@@ -28,7 +28,7 @@ from isac_rt.track.filter import (
     wrapped,
 )
 from isac_rt.track.settings import Tracking
-from isac_rt.track.tracker import Track, Tracker, assign, united
+from isac_rt.track.tracker import Track, Tracker, assign
 from isac_rt.world.swarm import Pose, attitude
 
 OWN = Pose(
@@ -491,33 +491,3 @@ def test_one_sure_detection_confirms_no_track(sure, frame):
         if first is None and tracker.tracks[0].confirmed:
             first = n
     assert first == frame
-
-
-@pytest.mark.parametrize(
-    ("apart", "std", "seen", "left"),
-    [
-        (0.3, 0.1, (-1, 4), [2]),
-        (0.3, 0.1, (4, -1), [2]),
-        (0.3, 0.1, (4, 5), [2, 7]),
-        (0.6, 0.1, (-1, 4), [2, 7]),
-        (0.3, 0.6, (-1, 4), [2, 7]),
-    ],
-)
-def test_two_tracks_of_one_body_are_one(apart, std, seen, left):
-    """Confirmed tracks nearer than UAVs fly, of which the frame shows one at most, under the older
-    one's number where the body was seen last. Planted bugs: both shown; any distance; places that
-    are hardly known; the older one's place kept."""
-
-    def one(number: int, x: float, detection: int) -> Track:
-        mean = np.concatenate([[x, 20.0, 5.0], np.zeros(6)])
-        state = Gaussian(mean, np.diag([std**2] * 3 + [1.0] * 6))
-        last = 0.1 if detection >= 0 else 0.0
-        return Track(number, state, 9.0, confirmed=True, detection=detection, last=last)
-
-    tracks = united([one(2, 0.0, seen[0]), one(7, apart, seen[1])])
-    assert [t.id for t in tracks] == left
-    if left == [2]:
-        assert tracks[0].state.mean[0] == (apart if seen[1] >= 0 else 0.0)
-        assert tracks[0].detection == 4
-    tentative = replace(one(7, apart, seen[1]), confirmed=False)
-    assert len(united([one(2, 0.0, seen[0]), tentative])) == 2

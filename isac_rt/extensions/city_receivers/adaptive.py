@@ -53,14 +53,6 @@ def scanned(
     return (float(x), float(z)), float((2 * limit) ** 2 * np.sqrt(np.linalg.det(covariance)))
 
 
-def scanned_within(
-    channels: Channels, wavenumber: float, width: np.ndarray
-) -> tuple[tuple[float, ...], float]:
-    """`scanned` of directions within a box, so wide (2,) in both cosines."""
-    sides, area = scanned(channels, wavenumber, 0.5)
-    return (sides[0] * width[0], sides[1] * width[1]), area * width[0] * width[1]
-
-
 def expected_count(t: float, lengths: tuple[float, ...], area: float, looks: int = 1) -> float:
     """Return the mean Euler characteristic of {T > t} over directions of such lengths and area
     (`scanned`), T a sum of `looks` unit exponentials; at least that of one beam."""

@@ -6,7 +6,7 @@ its steering vector, and tapered over the directions that are not known exactly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -80,11 +80,6 @@ class Bucketed:
             search.spread(taper.cosine),
             w.num_chirps,
         )
-
-    def among(self, some: np.ndarray) -> Bucketed:
-        """The same of some of the channels."""
-        steer = np.ascontiguousarray(self.steer[:, some])
-        return replace(self, steer=steer, shape=self.shape[np.ix_(some, some)])
 
     def covariances(self, rows: np.ndarray, bins: np.ndarray) -> np.ndarray:
         """(S, L, L) complex64 of noise and clutter in cells, Doppler in FFT order, in units of the

@@ -34,8 +34,8 @@ ALIAS_DEVIATIONS = 3.0
 
 
 class Images(TrackRule):
-    """No track starts from what may be an image of the terminal, at a passive one of its
-    transmitter, or an alias from beyond the view.
+    """No track starts from what may be an active terminal's own image, or an alias from beyond the
+    view.
 
     Parameters
     ----------
@@ -50,16 +50,12 @@ class Images(TrackRule):
         self._cells = np.array([waveform.range_cell(passes), waveform.velocity_cell(passes)])
 
     def births(self, detections: Detections, own: Own) -> Detections:
-        d, sender = detections, own.transmitter
+        d = detections
         spread = ALIAS_DEVIATIONS * d.std[:, 2:] if self._passes == 1 else 0.0
         inside = np.abs(d.direction) + spread < self._edge
         starts = d.starts & inside.all(axis=1)
-        if starts.any():
-            reach = float(d.range[starts].max()) + 1
-            if sender is None:
-                shown = own_images(own.pose, self._walls, reach)
-            else:
-                shown = sender_images(sender.mean[:6], own.pose, self._walls, reach)
+        if starts.any() and self._passes == 2:
+            shown = own_images(own.pose, self._walls, float(d.range[starts].max()) + 1)
             off = wrapped(d.measured[:, None, :2] - shown, self._ambiguity)
             beside = (np.abs(off) < BESIDE_CELLS * self._cells).all(axis=-1)
             starts &= ~beside.any(axis=1)

@@ -97,7 +97,11 @@ class OutOfSequence(OtherPaths):
         if out is None:
             return reception, False
         out = replace(out, detections=delayed(out.detections, own.clock, -1))
-        if out.line_of_sight and reference.is_plausible(out, own) and self._is_well_inside(out):
+        if (
+            out.line_of_sight
+            and reference.is_plausible(out, own.straight)
+            and self._is_well_inside(out)
+        ):
             self.forget()
             return out, True
         return out.without_sight(self._is_named(own)), False

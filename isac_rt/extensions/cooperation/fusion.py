@@ -24,9 +24,11 @@ from isac_rt.plain import Stateful
 from isac_rt.track.filter import Gaussian, mahalanobis, singer
 from isac_rt.track.fused import Fused, Key, Name
 from isac_rt.track.parts import POSE_STD
-from isac_rt.track.tracker import LEAST_APART, TrackSet, assign
+from isac_rt.track.tracker import TrackSet, assign
 from isac_rt.world.swarm import Pose
 
+LEAST_APART = 0.5
+"""UAVs keep farther from each other than this [m]: tracks part beyond twice this."""
 SIZE = 6
 """Position and velocity in world axes [m, m/s]: what terminals tell each other of a UAV."""
 DATUM_STD = (0.05, 0.05)
