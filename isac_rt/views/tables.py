@@ -343,28 +343,30 @@ def false_table(summary: Mapping[str, Any]) -> Table:
     return Table((_FALSE, "All", *titles), rows)
 
 
-def _uavs(summary: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """(link, UAV, figures) of the UAVs that were in view at some time, targets before terminals."""
-    terminals = {end for link in summary["links"] for end in link.split("->")}
-    for group in (False, True):
-        for link, s in summary["links"].items():
-            for uav, t in s.get("targets", {}).items():
-                if t["in_view"] and (uav in terminals) == group:
-                    yield link_words(link), f"{uav} (terminal)" if group else uav, t
+def _uavs(summary: Mapping[str, Any], group: str) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """(link, UAV, figures) of the ``targets`` or ``terminals`` that were in view at some time; in a
+    swarm of terminals alone these are the targets."""
+    every = [(link, s.get("targets", {})) for link, s in summary["links"].items()]
+    ends = {end for link, _ in every for end in link.split("->")}
+    terminals = ends if {uav for _, of in every for uav in of} - ends else set()
+    for link, of in every:
+        for uav, t in of.items():
+            if t["in_view"] and (uav in terminals) == (group == "terminals"):
+                yield link_words(link), uav, t
 
 
-def target_table(summary: Mapping[str, Any]) -> Table:
-    """The frames in which each UAV was in view, found and tracked."""
+def target_table(summary: Mapping[str, Any], group: str) -> Table:
+    """Tabulate the frames in which each UAV of a group was in view, found and tracked."""
     keys = ("in_view", "found", "tracked", "switches")
-    rows = [(link, uav, *(number(t[key]) for key in keys)) for link, uav, t in _uavs(summary)]
+    rows = [(link, u, *(number(t[key]) for key in keys)) for link, u, t in _uavs(summary, group)]
     return Table(("Link", "UAV", "In view", "Found", "Tracked", "Switches"), rows)
 
 
-def error_table(summary: Mapping[str, Any]) -> Table:
-    """Median and 90 % of the errors of each UAV, and the Cramer-Rao bound of both; UAVs that were
-    never found are left out."""
+def error_table(summary: Mapping[str, Any], group: str) -> Table:
+    """Median and 90 % of the errors of each UAV of a group, and the Cramer-Rao bound of both; UAVs
+    that were never found are left out."""
     rows = []
-    for link, uav, t in _uavs(summary):
+    for link, uav, t in _uavs(summary, group):
         if any(middle is not None for middle in t["median"].values()):
             rows.append(
                 (link, uav, "error", number(t.get("detected")), *_pairs(t["median"], t["p90"]))
@@ -385,9 +387,9 @@ def _pairs(middle: Mapping[str, float | None], most: Mapping[str, float | None])
     ]
 
 
-def loss_table(summary: Mapping[str, Any]) -> Table:
+def loss_table(summary: Mapping[str, Any], group: str) -> Table:
     """Tabulate the outcome of every target-frame in view; causes without frames are left out."""
-    rows = list(_uavs(summary))
+    rows = list(_uavs(summary, group))
     causes = [c for c in LOSSES if any(t["losses"][c] for _, _, t in rows)]
     titles = (cause.replace("_", " ").capitalize() for cause in causes)
     return Table(

@@ -28,6 +28,8 @@ from isac_rt.views.tables import (
 from isac_rt.world.city import load_city
 from isac_rt.world.settings import City
 
+OF_GROUPS = (hit_table, bound_table, rmse_table, target_table, error_table, loss_table)
+
 
 @pytest.fixture(scope="module")
 def summary():
@@ -42,17 +44,22 @@ def row(table, *names):
 def test_who_saw_what(summary):
     """PT1 had U1 in view in six frames of seven and found it in all but frame 5, 6.37 cm off; the
     AT hears four. Planted bugs: found and tracked swapped; the median of another axis."""
-    table = target_table(summary)
+    table = target_table(summary, "targets")
     at_pt = row(table, "AT to PT1", "U1")
     assert (at_pt["In view"], at_pt["Found"], at_pt["Tracked"]) == ("6", "5", "6")
-    errors = row(error_table(summary), "AT to PT1", "U1", "error")
+    errors = row(error_table(summary, "targets"), "AT to PT1", "U1", "error")
     assert errors["Range [m]"] == "0.064 / 0.064"
     assert errors["Velocity [m/s]"] == "0.13 / 0.13"
     # a normal error of 4 mm: 0.674 and 1.645 of it
-    bound = row(error_table(summary), "AT to PT1", "U1", "bound")
+    bound = row(error_table(summary, "targets"), "AT to PT1", "U1", "bound")
     assert bound["Range [m]"] == "0.0027 / 0.0066"
     assert row(table, "AT to AT", "U1")["In view"] == "3"
-    assert [r[1] for r in table.rows] == ["U1", "U1", "AT (terminal)"]
+    assert [r[1] for r in table.rows] == ["U1", "U1"]
+    assert [r[1] for r in target_table(summary, "terminals").rows] == ["AT"]
+    alone = copy.deepcopy(summary)
+    for block in alone["links"].values():
+        block["targets"].pop("U1")
+    assert [r[1] for r in target_table(alone, "targets").rows] == ["AT"]
 
 
 def test_a_sensor_has_no_data_and_no_legend_of_data(summary):
@@ -119,7 +126,7 @@ def test_walls_behind_what_was_seen():
 
 def test_why_not(summary):
     """Causes that never were have no column."""
-    table = loss_table(summary)
+    table = loss_table(summary, "targets")
     assert table.columns == ("Link", "UAV", "Found", "Inaccurate")
     assert row(table, "AT to PT1", "U1") == {
         "Link": "AT to PT1",
@@ -145,10 +152,9 @@ def test_summaries_of_earlier_versions_have_none(summary):
     for block in old["links"].values():
         for key in ("in_view", "tracked_rate", "cooperative", "false_tracks", "targets"):
             del block[key]
-    for table in (false_table, target_table, error_table, loss_table):
-        assert not table(old).rows
+    assert not false_table(old).rows
     for group in ("targets", "terminals"):
-        for table in (hit_table, bound_table, rmse_table):
+        for table in OF_GROUPS:
             assert not table(old, group).rows
 
 
@@ -163,9 +169,8 @@ def test_tables_fit_the_page(summary):
             target["losses"] = dict.fromkeys(target["losses"], 1234)
             for key in ("median", "p90", "bound_median", "bound_p90"):
                 target[key] = dict.fromkeys(target[key], 0.00012345)
-    of_groups = (hit_table, bound_table, rmse_table)
-    for table in (*of_groups, false_table, target_table, error_table, loss_table):
-        found = table(full, "targets") if table in of_groups else table(full)
+    for table in (*OF_GROUPS, false_table):
+        found = table(full, "targets") if table in OF_GROUPS else table(full)
         cells = zip(found.columns, *found.rows, strict=True)
         width = sum(max(map(len, column)) * 7.5 + 22 for column in cells)
         assert width < 1200, table.__name__
@@ -183,7 +188,7 @@ def test_the_report_shows_targets_first_and_maps_before_tables(tmp_path):
     page = write_report(results, tmp_path, pictures).read_text()
     at = {p.stem: page.index(base64.b64encode(p.read_bytes()).decode() + '"') for p in pictures}
     assert all(page.count(base64.b64encode(p.read_bytes()).decode() + '"') == 1 for p in pictures)
-    parts = [page.index(f"<h2>{t}</h2>") for t in ("Targets", "Range-Doppler maps", "Each UAV")]
+    parts = [page.index(f"<h2>{t}</h2>") for t in ("Targets", "Range-Doppler maps", "Each target")]
     assert parts == sorted(parts) and parts[1] < at["range_doppler_0001"] < at["errors"] < parts[2]
     assert page.index("<h2>Terminals</h2>") < at["errors_terminals"] < at["decoding"] < at["mine"]
     for block in results.summary["links"].values():
