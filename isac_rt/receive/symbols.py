@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -45,6 +46,32 @@ their symbols is their error: wrapping hides a tenth of it at most."""
 PREDICTED_STDS, READABLE_TURN = 3.0, 1 / 3
 """Deviations of the predicted velocity within which a path moves as predicted, and turn of a mean
 transition [symbols]: beyond it most are wrong."""
+ELSEWHERE_RATE = 1e-4
+"""Chance that noise makes the phases of a path that moves as predicted likelier elsewhere."""
+
+
+class Gathering(NamedTuple):
+    """Mean cosine of the D-th powers of transitions, for the best velocity `inside` what the
+    prediction allows and the best of all `outside`, and the numbers of `transitions` and of
+    `velocities` tried."""
+
+    inside: float
+    outside: float
+    transitions: int
+    velocities: int
+
+    def elsewhere(self, phase_noise: float) -> bool:
+        """Return whether a velocity outside is likelier than those inside beyond chance.
+
+        Phases to the power D have von Mises' density of a concentration that follows from the RMS
+        `phase_noise` of the D-th powers [rad], or from what is seen, which clutter spreads. Where
+        the path moves as predicted, the likelihood ratio to each other velocity exceeds 1/q with a
+        chance of q at most (Markov).
+        """
+        mean = min(np.exp(-(phase_noise**2) / 2), max(self.inside, self.outside, 0.0), 1 - 1e-9)
+        concentration = mean * (2 - mean**2) / (1 - mean**2)
+        ratio = self.transitions * concentration * (self.outside - self.inside)
+        return bool(ratio > np.log(self.velocities / ELSEWHERE_RATE))
 
 
 @dataclass(frozen=True)
@@ -55,7 +82,8 @@ class Symbols:
     transition, the cosine-like share
     |sum y conj(y')| / sum |y y'|, in [0, 1]. `phase_spread` is the RMS distance of the transitions
     from their symbols [rad], `least_spread` the least that it is for any velocity within
-    `PREDICTED_STDS` deviations of the predicted one; None: the same. `looks` receivers are added in
+    `PREDICTED_STDS` deviations of the predicted one; None: the same. `gathering` compares these
+    velocities with all others; None: not compared. `looks` receivers are added in
     power. `soft_bits` are the bits' log-likelihood ratios ln P(0)/P(1), from beams only.
     """
 
@@ -70,6 +98,7 @@ class Symbols:
     looks: int
     soft_bits: np.ndarray = field(default_factory=lambda: np.zeros(0))
     least_spread: float | None = None
+    gathering: Gathering | None = None
 
 
 @lru_cache(maxsize=64)
@@ -139,6 +168,7 @@ def demodulate(
     summed, share = transition_sums(picked, cube.schedule, w.num_tx)
     transitions, spread = nearest_symbols(summed, dpsk_order)
     times = by_antenna(w.middle_time + raw * w.delay_step, cube.schedule, w.num_tx)
+    lengths = np.diff(times, axis=-1)
     far = PREDICTED_STDS * prediction.velocity_std[0] / SPEED_OF_LIGHT * w.effective_carrier
     return Symbols(
         raw=raw,
@@ -150,7 +180,8 @@ def demodulate(
         phases=running_phases(transitions, cube.schedule, dpsk_order),
         bits=demodulate_bits(delay, transitions, w, dpsk_order),
         looks=cube.samples.shape[1],
-        least_spread=least_spread(summed, np.diff(times, axis=-1), far, dpsk_order),
+        least_spread=least_spread(summed, lengths, far, dpsk_order),
+        gathering=gathering(summed, lengths, far, 0.5 / w.slot_duration, dpsk_order),
     )
 
 
@@ -239,18 +270,41 @@ def least_spread(summed: np.ndarray, length: np.ndarray, far: float, order: int)
     return float(np.sqrt(spread.min()) * 2 * np.pi / order)
 
 
+def gathering(
+    summed: np.ndarray, length: np.ndarray, far: float, farthest: float, order: int
+) -> Gathering:
+    """Return how `transition_sums`, `length` apart in time [s], gather for errors of the Doppler
+    frequency up to `far` [Hz], and for those beyond, up to `farthest`."""
+    turns = 2 * np.pi * order * length.ravel()
+    # spacings that turn the longest transition to the power D by a fiftieth, and by a fifth
+    fine, coarse = (share / (length.max() * order) for share in (0.02, 0.2))
+    near = np.linspace(-far, far, 2 * int(np.ceil(far / fine)) + 1)
+    beyond = np.arange(far + coarse, farthest, coarse)
+    beyond = np.concatenate([-beyond, beyond])
+    inside, outside = (
+        np.cos(order * np.angle(summed).ravel() - np.multiply.outer(errors, turns)).mean(axis=1)
+        for errors in (near, beyond)
+    )
+    size = near.size + beyond.size
+    return Gathering(float(inside.max()), float(outside.max(initial=-1.0)), summed.size, size)
+
+
 def moves_as_predicted(symbols: Symbols, order: int) -> bool:
     """Return whether the DPSK phases gather at the symbols, as far as the noise lets this be seen.
 
     The delay decisions take whatever path is strongest, and the DPSK decisions take up the whole
     symbols of its Doppler, so that a reflection always ends up near the predicted cell. But unless
     it moves as predicted its phases lie anywhere between the symbols: a spread of pi/D/sqrt(3).
-    A path that the prediction allows, within its deviation, moves as predicted.
+    A path that the prediction allows, within its deviation, moves as predicted, unless another
+    velocity explains the phases better (`Gathering`).
     """
     anywhere = np.pi / order / np.sqrt(3)
     from_noise, least = transition_noise(symbols), symbols.least_spread
     spread = symbols.phase_spread if least is None else min(least, symbols.phase_spread)
-    return bool(from_noise > 0.6 * anywhere or spread < 0.8 * anywhere)
+    if from_noise > 0.6 * anywhere:
+        return True
+    other = symbols.gathering is not None and symbols.gathering.elsewhere(order * from_noise)
+    return bool(spread < 0.8 * anywhere) and not other
 
 
 def transition_noise(symbols: Symbols) -> float:
