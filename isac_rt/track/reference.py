@@ -222,7 +222,7 @@ class Reference(Stateful):
         most `EVIDENCE_FRAMES` frames, and none of the latter, which a second path in the cell would
         leave there.
         """
-        new = _end_symbols(reception, self._groups, self._waveform)
+        new = end_symbols(reception, self._groups, self._waveform)
         self.state.ends = [*self.state.ends, new][-EVIDENCE_FRAMES:]
         if self.track is None:
             return 0
@@ -235,7 +235,7 @@ class Reference(Stateful):
             self.state.ends = []
 
 
-def _end_symbols(
+def end_symbols(
     reception: Reception, groups: Sequence[int] | None, waveform: Waveform
 ) -> np.ndarray:
     """Return the confident raw symbols of a frame near and beyond either end of the alphabet."""

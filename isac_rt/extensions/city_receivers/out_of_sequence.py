@@ -16,13 +16,14 @@ import numpy as np
 from isac_rt.extensions.city_receivers.blind import DataPath, Peaks, acquire, find_peaks, read_peaks
 from isac_rt.extensions.city_receivers.images import WELL_INSIDE, sender_images
 from isac_rt.extensions.city_receivers.walls import Walls
+from isac_rt.frame.antennas import resolutions
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.types import Detections, Hints, Prediction, Reception
 from isac_rt.track.filter import measure
 from isac_rt.track.parts import Late, OtherPaths, Own, delayed
-from isac_rt.track.reference import COAST_CELLS, Reference
+from isac_rt.track.reference import COAST_CELLS, Reference, end_symbols, slip_cells
 
 BATCH = 8
 """Frames kept at most."""
@@ -30,7 +31,8 @@ SPAN = 0.5
 """Age at which a frame is let go [s]: longer flights bend more than the comb tries."""
 GATE_CELLS, GATE_STDS = 0.4, 3.0
 """Cells, or deviations of what is predicted, within which the path is found again in a frame that
-was read over it."""
+was read over it, and in its direction to a resolution. A frame in which it is not was read over
+another path, and all its symbols by the same number of cells too low or too high."""
 STD_CELLS = 0.02
 """Floor of its range and velocity deviations in cells."""
 NAMED_CELLS = 1.5
@@ -65,7 +67,9 @@ class OutOfSequence(OtherPaths):
         self, receiver: PassiveReceiver, waveform: Waveform, walls: Walls | None = None
     ) -> None:
         self._receiver, self._waveform, self._walls = receiver, waveform, walls
-        self._cells = np.array([waveform.range_cell(1), waveform.velocity_cell(1)])
+        resolution = resolutions(waveform, receiver.antennas, 1)
+        self._cells, self._beam = resolution[:2], resolution[2:]
+        self._turn = receiver.antennas.turn(waveform.wavelength, 1)
         self.state = Waiting()
         self.late: tuple[Late, ...] = ()
 
@@ -157,7 +161,12 @@ class OutOfSequence(OtherPaths):
         self.state.path = DataPath(own.time, mean, np.diag(spread), p.direction[0])
 
     def start(self, detections: Detections, time: float) -> None:
-        """Go on over the strongest path of a frame without data whose reference is none."""
+        """Go on over the known path where a frame without data and without a reference shows it,
+        else over the strongest one."""
+        if self.state.path is not None:
+            self.state.path = self.state.path.at(time)
+            if self._follow(detections):
+                return
         d = detections.select(np.isfinite(detections.direction).all(axis=1))
         if len(d):
             i = int(d.snr.argmax())
@@ -206,19 +215,30 @@ class OutOfSequence(OtherPaths):
         if expected.range_std[0] > COAST_CELLS * self._cells[0]:
             return None
         out = self._receiver.receive_over(cube, expected, hints, maps=maps)
-        if not out.decoded:
+        if not out.decoded or not self._follow(out.detections):
             return None
-        d = out.detections
-        off = np.abs(np.stack([d.range, d.velocity]).T - self.state.path.mean[:2])
+        ends = end_symbols(out, self._receiver.groups, self._waveform)
+        return None if slip_cells(ends, self._waveform.num_delay_symbols) else out
+
+    def _follow(self, d: Detections) -> bool:
+        """Update the path by the detection that is it; return whether there is one."""
+        path = self.state.path
+        assert path is not None
+        off = np.abs(np.stack([d.range, d.velocity]).T - path.mean[:2])
         gate = np.maximum(
-            GATE_CELLS * self._cells, GATE_STDS * np.sqrt(np.diag(self.state.path.covariance)[:2])
+            GATE_CELLS * self._cells, GATE_STDS * np.sqrt(np.diag(path.covariance)[:2])
         )
-        near = (off < gate).all(axis=1) & np.isfinite(d.direction).all(axis=1)
-        if near.any():
-            i = int(np.where(near, d.snr, -1.0).argmax())
-            measured = np.array([d.range[i], d.velocity[i]])
-            self.state.path = self.state.path.seen(measured, self._deviations(d, i), d.direction[i])
-        return out
+        aside = np.nan_to_num(d.direction - path.direction)  # zero on an axis that is not seen
+        if np.isfinite(self._turn):  # cosines that the array does not tell apart
+            aside -= self._turn * np.round(aside / self._turn)
+        near = (off < gate).all(axis=1) & (np.abs(aside) < self._beam).all(axis=1)
+        if not near.any():
+            return False
+        i = int(np.where(near, d.snr, -1.0).argmax())
+        measured = np.array([d.range[i], d.velocity[i]])
+        direction = np.where(np.isfinite(d.direction[i]), d.direction[i], path.direction)
+        self.state.path = path.seen(measured, self._deviations(d, i), direction)
+        return True
 
     def _deviations(self, detections: Detections, i: int) -> np.ndarray:
         """Return the standard deviations of range and velocity of a detection (2,)."""
