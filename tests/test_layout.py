@@ -241,7 +241,7 @@ MAX_LINES = {
     "world": 3690,
     "propagation": 4680,
     "signal": 820,
-    "receive": 6030,
+    "receive": 6040,
     "track": 1864,
     "scenario": 1710,
     "results": 3580,
