@@ -182,7 +182,7 @@ def test_the_way_keeps_to_the_flight():
         for t, p in ((0.4, (0, 0, 9)), (1.7, (11, 3, 9)), (2.3, (9, 14, 12)), (3.9, (-8, 9, 7)))
     ]
     flight = Trajectory(Uav(role="target", waypoints=waypoints))
-    times, places = flight.way(-0.3, 4.4)
+    times, places = flight.polyline(-0.3, 4.4)
     assert times[0] == -0.3 and times[-1] == 4.4 and len(times) < 300
     for a, b, p, q in zip(times[:-1], times[1:], places[:-1], places[1:], strict=True):
         for share in (0.21, 0.5, 0.83):
@@ -191,7 +191,7 @@ def test_the_way_keeps_to_the_flight():
             off = place - p - ((place - p) @ along) * along
             assert np.linalg.norm(off) <= SAG_M
     straight = Trajectory(Uav(role="target", position_m=(0, 0, 9), velocity_mps=(3, 1, 0)))
-    assert len(straight.way(0.0, 9.0)[0]) == 2
+    assert len(straight.polyline(0.0, 9.0)[0]) == 2
 
 
 ROOM = trimesh.creation.box((10, 8, 3)).apply_translation((0, 0, 1.5))
