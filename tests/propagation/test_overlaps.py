@@ -93,6 +93,7 @@ def test_walls_that_lie_twice_are_one_surface(tmp_path, alone, name):
 
 @pytest.mark.sionna
 @pytest.mark.filterwarnings("ignore::isac_rt.document.ScenarioWarning")
+@pytest.mark.slow
 def test_a_higher_part_adds_the_wall_above_its_building(tmp_path):
     """A building of six levels with a part of eight, at a passive terminal, over 6 draws: the mean
     is within 0.2 dB of the same solid without a surface twice (a draw fluctuates by 0.11 dB,

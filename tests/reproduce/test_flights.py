@@ -111,6 +111,7 @@ def test_a_folder_of_scenes_is_flown_once(tmp_path, monkeypatch, capsys):
     assert "--scenes" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_drawn_scenes_are_free_and_of_all_kinds(tmp_path, monkeypatch):
     """Twelve draws in the small street and the blocks: speeds, sizes, terminals that look at the
     targets, and rays that see half of these. Planted bug: boresights that are not turned with the
