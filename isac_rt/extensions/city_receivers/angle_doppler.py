@@ -60,7 +60,7 @@ this share of its power: over a wall on one way alone two equal waves arrive. A 
 flies by adds less, in a canyon 0.1 to 0.2 of the UAV's echo."""
 
 
-MAIN_LOBE = 3.0
+REPEAT_CELLS = 3.0
 """Cells of the range and the velocity window's main lobe on each side, and one for migration."""
 
 
@@ -154,15 +154,11 @@ class AngleDoppler:
         self, maps: np.ndarray, known: Known, tested: Tested, cell: tuple[int, int]
     ) -> list[Wave]:
         """Return the waves of a cell in which something was found."""
-        search, (row, column), bins = (
-            channel_search(known.antennas, known.wavenumber),
-            cell,
-            maps.shape[3],
-        )
+        search, bins = channel_search(known.antennas, known.wavenumber), maps.shape[3]
+        (row, column), c = cell, search.channels
         inverse = tested.whiteners.get(cell)
         if inverse is None:
-            inverse = np.eye(len(search.channels), dtype=np.complex64)
-        c = search.channels
+            inverse = np.eye(len(c), dtype=np.complex64)
         x = maps[c.tx, c.rx, row, (column + bins // 2) % bins]
         ratio = float(tested.ratio[cell])
         return waves_of(x, inverse, tested.cosines[cell], search, ratio)
@@ -292,16 +288,18 @@ def over_walls(d: Detections, cells: np.ndarray, known: Known) -> np.ndarray:
     """Mark waves (Q,) that share a cell (Q, 2) of which one comes from where a nearer and stronger
     detection is that may start a track: an echo over a wall on one way arrives from its source
     and from the wall."""
-    nearer = _off(d, known)[..., 0] > MAIN_LOBE
+    off = _off(d, known)
+    sources = (off[..., 0] > REPEAT_CELLS) & d.starts & _same_direction(off, d.snr)
     together = (cells[:, None] == cells).all(axis=2)
-    source = (together & (nearer & d.starts & _same_direction(d, known)).any(axis=1)).any(axis=1)
+    source = (together & sources.any(axis=1)).any(axis=1)
     return np.asarray((together.sum(axis=1) > 1) & source)
 
 
 def repeated(d: Detections, known: Known) -> np.ndarray:
     """Mark detections (Q,) in the main lobe of a stronger one from the same direction."""
-    beside = (np.abs(_off(d, known)[..., :2]) < MAIN_LOBE).all(axis=2)
-    return np.asarray((beside & _same_direction(d, known)).any(axis=1))
+    off = _off(d, known)
+    beside = (np.abs(off[..., :2]) < REPEAT_CELLS).all(axis=2)
+    return np.asarray((beside & _same_direction(off, d.snr)).any(axis=1))
 
 
 def _off(d: Detections, known: Known) -> np.ndarray:
@@ -310,10 +308,10 @@ def _off(d: Detections, known: Known) -> np.ndarray:
     return np.asarray(off / resolutions(known.waveform, known.antennas, known.passes))
 
 
-def _same_direction(d: Detections, known: Known) -> np.ndarray:
-    """(Q, Q) which detections come from where others are that are stronger."""
-    near = (np.abs(_off(d, known)[..., 2:]) < 0.5).all(axis=2)
-    return np.asarray(near & (d.snr > d.snr[:, None]))
+def _same_direction(off: np.ndarray, snr: np.ndarray) -> np.ndarray:
+    """(Q, Q) which detections come from where others are that are stronger, by `_off`."""
+    near = (np.abs(off[..., 2:]) < 0.5).all(axis=2)
+    return np.asarray(near & (snr > snr[:, None]))
 
 
 def in_sidelobe(rows: np.ndarray, bins: np.ndarray, power: np.ndarray, first: int) -> np.ndarray:

@@ -7,8 +7,8 @@ enough to make it suspect:
 - Is it one of the echoes that a nearer UAV must have over walls? There (straight) and back (over
   a wall), the reverse, or over a wall on both ways: their ranges, rates and directions follow from
   the source's state and the wall's plane. An echo over a wall is longer than the direct one, and
-  so weaker by a factor that the lengths bound. The body is another track, or one that
-  the terminal was told of: a UAV that the line of sight masks is received by its echoes over walls.
+  so weaker by a factor that the lengths bound. The source is another track, or a UAV that other
+  terminals report: one that the line of sight masks is received by its echoes over walls.
 - Does it lie behind a surface of the mesh? No UAV there could be seen straight.
 
 A passive terminal asks the same of its reflectors, whose echoes come from its reference, the active
@@ -133,6 +133,11 @@ class Leeway:
         turn = antennas.turn(waveform.wavelength, passes)
         return cls(cells, Ambiguity.of(waveform, passes), turn)
 
+    def folded(self, off: np.ndarray) -> np.ndarray:
+        """Return differences (..., 2) of cosines by the nearest readings of those that the array
+        does not tell apart."""
+        return off - self.turn * np.round(off / self.turn) if np.isfinite(self.turn) else off
+
     def explained(
         self, off: np.ndarray, std: np.ndarray, one_way: bool | np.ndarray = False
     ) -> np.ndarray:
@@ -140,8 +145,7 @@ class Leeway:
         deviations and whether they are of an active terminal's echo over a wall on `one_way` (...).
         """
         off = wrapped(off, self.ambiguity)
-        if np.isfinite(self.turn):
-            off[..., 2:] -= self.turn * np.round(off[..., 2:] / self.turn)
+        off[..., 2:] = self.folded(off[..., 2:])
         share = np.where(np.asarray(one_way)[..., None], ONE_WAY_SHARE, RESOLUTION_SHARE)
         share = np.where([False, False, True, True], share, RESOLUTION_SHARE)
         allowed = DEVIATIONS * std + share * self.resolution
@@ -157,7 +161,7 @@ class Suspicion:
     ----------
     mirrored : (K,) int32 face of the wall that explains the track as an echo of a nearer one, -1:
         none does
-    source : (K,) int64 id of that nearer track, -1: none, or one that the terminal was told of
+    source : (K,) int64 id of that nearer track, -1: none, or one that others report
     order : (K,) int8 bounces: 1 off that wall on one of the two ways, 2 on both, 0: none. At a
         passive terminal the second wall may be another; `mirrored` is the first
     behind : (K,) int32 face that hides the place of the track from the terminal or, at a passive
@@ -256,7 +260,7 @@ def alone(d: Detections, leeway: Leeway) -> np.ndarray:
 
 
 def _weaker(known: TrackSet, s: int, sender: np.ndarray | None, ranges: np.ndarray) -> np.ndarray:
-    """Return a bound on the power of echoes of body `s` over walls, of such ranges (K,), relative
+    """Return a bound on the power of echoes of track `s` over walls, of such ranges (K,), relative
     to its direct one: no segment is shorter than the direct path's."""
     back = float(np.linalg.norm(known.mean[s, :3]))
     if known.is_reference[s]:

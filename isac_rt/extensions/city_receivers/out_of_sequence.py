@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from isac_rt.extensions.city_receivers.blind import DataPath, Peaks, acquire, find_peaks, read_peaks
+from isac_rt.extensions.city_receivers.ghosts import Leeway
 from isac_rt.extensions.city_receivers.images import WELL_INSIDE, sender_images
 from isac_rt.extensions.city_receivers.walls import Walls
-from isac_rt.frame.antennas import resolutions
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.passive import PassiveReceiver
@@ -67,9 +67,8 @@ class OutOfSequence(OtherPaths):
         self, receiver: PassiveReceiver, waveform: Waveform, walls: Walls | None = None
     ) -> None:
         self._receiver, self._waveform, self._walls = receiver, waveform, walls
-        resolution = resolutions(waveform, receiver.antennas, 1)
-        self._cells, self._beam = resolution[:2], resolution[2:]
-        self._turn = receiver.antennas.turn(waveform.wavelength, 1)
+        self._leeway = Leeway.of(waveform, receiver.antennas, 1)
+        self._cells, self._beam = np.split(self._leeway.resolution, 2)
         self.state = Waiting()
         self.late: tuple[Late, ...] = ()
 
@@ -228,9 +227,8 @@ class OutOfSequence(OtherPaths):
         gate = np.maximum(
             GATE_CELLS * self._cells, GATE_STDS * np.sqrt(np.diag(path.covariance)[:2])
         )
-        aside = np.nan_to_num(d.direction - path.direction)  # zero on an axis that is not seen
-        if np.isfinite(self._turn):  # cosines that the array does not tell apart
-            aside -= self._turn * np.round(aside / self._turn)
+        # zero on an axis that is not seen
+        aside = self._leeway.folded(np.nan_to_num(d.direction - path.direction))
         near = (off < gate).all(axis=1) & (np.abs(aside) < self._beam).all(axis=1)
         if not near.any():
             return False
