@@ -26,7 +26,7 @@ class Explanation(NamedTuple):
     target : (Q,) int16 index into the set's target names, -1 also where no UAV is involved
     order : (Q,) int16 interactions with the city, 0 of a direct path
     face : (Q,) int32 face of the city's mesh that the path meets first, -1 also where it meets none
-    sidelobe : (Q,) bool, the path lies more than a cell away: the detection is in its skirt
+    sidelobe : (Q,) bool, the path lies more than a cell away: the detection is one of its sidelobes
     """
 
     kind: np.ndarray
@@ -133,7 +133,7 @@ def explain(
     of the noise explains nothing. Paths of one cell reach a detection together, and the strongest
     decides; but a receiver that looks by beam, or takes strong paths out first, finds a weak one
     beside it. So a path of the cell that comes from where the detection says is the cause before
-    a stronger one from elsewhere, and before the skirt of one whose direction fits worse.
+    a stronger one from elsewhere, and before the sidelobes of one whose direction fits worse.
 
     Parameters
     ----------

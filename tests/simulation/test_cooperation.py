@@ -44,14 +44,14 @@ def pooled():
 def test_nothing_else_of_a_run_depends_on_what_is_told(talked, pooled):
     """The same bits. Planted bug: a picture's track that updates a terminal's tracker."""
     alone = simulate.run(scenario(cooperation="none"), snapshots=2)
-    for reported_to in (talked, pooled):
+    for talking in (talked, pooled):
         for name, variable in alone.dataset.variables.items():
             kind = variable.dtype.kind == "f"
-            assert np.array_equal(
-                reported_to.dataset[name].values, variable.values, equal_nan=kind
-            ), name
+            assert np.array_equal(talking.dataset[name].values, variable.values, equal_nan=kind), (
+                name
+            )
         for key in ("terminals", "links", "paths"):
-            assert reported_to.summary[key] == alone.summary[key]
+            assert talking.summary[key] == alone.summary[key]
     assert alone.summary["swarm"] is None
 
 
@@ -146,17 +146,15 @@ def test_a_terminal_that_does_not_decode_hears_nothing():
         assert received[name]["messages"] == received[name]["messages_lost"] > 0
         assert received[name]["reports_per_frame"] == 0
     assert len(known["AT->AT"]) == 6
-    assert not [
-        b for reported_to in known.values() for uavs in reported_to for b in uavs if b.terminal
-    ]
+    assert not [b for by_frame in known.values() for uavs in by_frame for b in uavs if b.terminal]
 
 
-@pytest.mark.parametrize("reported_to", ["tracks", "detections"])
-def test_a_stopped_run_goes_on_to_the_same_pictures(reported_to, tmp_path):
+@pytest.mark.parametrize("cooperation", ["tracks", "detections"])
+def test_a_stopped_run_goes_on_to_the_same_pictures(cooperation, tmp_path):
     """Also of a set that is compared. Planted bugs: the channels, the names or what fed the tracks
     not taken up."""
     other = {"other": ReceiverSet(receivers=Receivers(), tracking=Tracking(confirm_hits=2))}
-    flight = scenario(frames=7, compare=other, cooperation=reported_to)
+    flight = scenario(frames=7, compare=other, cooperation=cooperation)
     whole = simulate.run(flight, snapshots=2)
     for stop in (3, 5, None):
         resume = Resume(tmp_path, run_content(flight, 2), every=0.0)
@@ -172,9 +170,9 @@ def test_the_report_and_the_moving_picture_show_the_pictures(talked):
     table = swarm_table(talked.summary)
     assert [row[0] for row in table.rows] == ["Whole swarm", "AT", "PT"]
     assert table.rows[2][-1].startswith("0 of ")
-    reported_to = talked.summary["swarm"]["terminals"]["PT"]
-    assert table.rows[2][-3] == str(reported_to["left_out"]) and reported_to["left_out"] > 0
-    assert reported_to["bits"] < reported_to["bits_room"] == 886 * 7
+    traffic = talked.summary["swarm"]["terminals"]["PT"]
+    assert table.rows[2][-3] == str(traffic["left_out"]) and traffic["left_out"] > 0
+    assert traffic["bits"] < traffic["bits_room"] == 886 * 7
     d = talked.dataset
     corners, faces = np.eye(3), np.array([[0, 1, 2]])
     roof = CityMesh("roof", corners, faces, np.zeros(1, np.int16), (), np.zeros(3))
@@ -223,7 +221,7 @@ def test_a_reference_is_not_told_as_a_detection():
     np.testing.assert_allclose(scan.z, z[1:])
 
 
-def noting(reported_to):
+def noting(reports):
     """Makes standard terminals that put down by link what they are told."""
 
     def terminal(setup, link):
@@ -231,7 +229,7 @@ def noting(reported_to):
         step = made.step
 
         def noted(*given, **options):
-            reported_to.setdefault(str(link), []).append(options["reports"])
+            reports.setdefault(str(link), []).append(options["reports"])
             return step(*given, **options)
 
         made.step = noted
@@ -249,17 +247,17 @@ def test_terminals_are_told_of_everybody_but_themselves_and_their_transmitter(tm
     whole, resumed = {}, {}
     simulate.run(flight, snapshots=0, terminal=noting(whole))
     swarm = simulate.prepare(flight).swarm
-    for link, reported_to in whole.items():
-        assert len(reported_to) == flight.frames and not reported_to[0]
+    for link, reports in whole.items():
+        assert len(reports) == flight.frames and not reports[0]
         poses = swarm.poses((flight.frames - 1) * flight.frame_interval_s)
         away = {
-            n: [np.linalg.norm(uav.state.mean[:3] - p.position) for uav in reported_to[-1]]
+            n: [np.linalg.norm(uav.state.mean[:3] - p.position) for uav in reports[-1]]
             for n, p in poses.items()
         }
         assert min(away["U"]) < 0.03
         ends = set(link.split("->"))
         assert all(min(away[name]) > 3 for name in ends)
-        assert [b.terminal for b in reported_to[-1] if b.terminal] == sorted({"AT", "PT"} - ends)
+        assert [b.terminal for b in reports[-1] if b.terminal] == sorted({"AT", "PT"} - ends)
 
     def kept():
         return Resume(tmp_path, run_content(flight, 0), every=0.0)
@@ -267,9 +265,9 @@ def test_terminals_are_told_of_everybody_but_themselves_and_their_transmitter(tm
     with pytest.raises(Stopped):
         simulate.run(flight, snapshots=0, resume=kept(), progress=stopping_at(4))
     simulate.run(flight, snapshots=0, resume=kept(), terminal=noting(resumed))
-    for link, reported_to in resumed.items():
-        assert 0 < len(reported_to) < flight.frames
-        for again, before in zip(reported_to[::-1], whole[link][::-1], strict=False):
+    for link, reports in resumed.items():
+        assert 0 < len(reports) < flight.frames
+        for again, before in zip(reports[::-1], whole[link][::-1], strict=False):
             assert [uav.terminal for uav in again] == [uav.terminal for uav in before]
             for one, other in zip(again, before, strict=True):
                 assert np.array_equal(one.state.mean, other.state.mean)

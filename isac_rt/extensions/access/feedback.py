@@ -99,8 +99,8 @@ def echo_of(reported: TrackSet, own: TrackSet) -> int | None:
     if not reference.size or not sure.size:
         return None
     back = -reported.mean[reference[0], :3]
-    directions_ = own.mean[sure, :3]
-    cosine = directions_ @ back / (np.linalg.norm(directions_, axis=1) * np.linalg.norm(back))
+    echoes = own.mean[sure, :3]
+    cosine = echoes @ back / (np.linalg.norm(echoes, axis=1) * np.linalg.norm(back))
     best = int(cosine.argmax())
     return int(sure[best]) if cosine[best] > np.cos(SAME_DIRECTION) else None
 

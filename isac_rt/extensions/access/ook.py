@@ -77,9 +77,9 @@ def choose_run(taken: np.ndarray, length: int, wished: int | None = None) -> int
     return min(starts, key=lambda b: (abs(b - (wished or 0)), b))
 
 
-def consensus(answers: Sequence[T]) -> T | None:
+def consensus(votes: Sequence[T]) -> T | None:
     """Return the value that most blocks agree on; None without any or with a tie."""
-    ranked = Counter(answers).most_common(2)
+    ranked = Counter(votes).most_common(2)
     if not ranked or (len(ranked) > 1 and ranked[0][1] == ranked[1][1]):
         return None
     return ranked[0][0]

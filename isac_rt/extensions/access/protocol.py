@@ -322,10 +322,10 @@ def _join(air: _Air, at: str, block: int) -> dict[Link, LinkState]:
     n = air.n
     pts = list(n.listeners[at])
     said = Message(n.names.index(at), block)
-    answers = _announce(air, said, pts)
+    announced = _announce(air, said, pts)
     first: dict[str, Round | None] = {}
     second: dict[str, Round | None] = {}
-    understood = {pt: got[0] for pt, got in answers.items() if got is not None}
+    understood = {pt: got[0] for pt, got in announced.items() if got is not None}
     if not n.external_clock:
         first = _first_round(air, at, block, understood)
         understood = {pt: b for pt, b in understood.items() if first[pt] is not None}
@@ -333,7 +333,7 @@ def _join(air: _Air, at: str, block: int) -> dict[Link, LinkState]:
     read_back = _acknowledge(air, at, block, pts, understood)
     out = {}
     for pt in pts:
-        got = answers[pt]
+        got = announced[pt]
         message = None if got is None else got[1]
         clock = EXTERNAL if n.external_clock else _clock(n, at, pt, first.get(pt), second.get(pt))
         out[Link(at, pt)] = LinkState(

@@ -217,11 +217,11 @@ def _by_clock(offset: np.ndarray, baseline: np.ndarray) -> np.ndarray:
     return u * (length - d - rho * (1 - ahead / d)) / (length - ahead)
 
 
-def report_of(report_: Gaussian) -> Reported:
+def report_of(itself: Gaussian) -> Reported:
     """The same (`of_itself`) with the errors of its pose apart."""
     lever = np.zeros((SIZE, ERRORS))
     lever[range(SIZE), range(SIZE)] = np.repeat(POSE_STD, 3)
-    return Reported(Gaussian(report_.mean, OWN_NOISE**2 * np.eye(SIZE)), lever)
+    return Reported(Gaussian(itself.mean, OWN_NOISE**2 * np.eye(SIZE)), lever)
 
 
 def in_datum(state: Gaussian) -> Gaussian:
@@ -349,10 +349,10 @@ def _solved(
     words : a UAV's number, the numbers of the errors in what is told of it (`num_errors`: one that
         is in none), what is told, and its weight
     """
-    numbers, errors, reported_to, weights = zip(*words, strict=True)
+    numbers, errors, reports, weights = zip(*words, strict=True)
     given = [np.array(numbers), np.array(errors), np.array(weights, float)]
-    states = [[t.state.mean for t in reported_to], [t.state.covariance for t in reported_to]]
-    arrays = [np.array(of) for of in (*states, [t.lever for t in reported_to])]
+    states = [[t.state.mean for t in reports], [t.state.covariance for t in reports]]
+    arrays = [np.array(of) for of in (*states, [t.lever for t in reports])]
     every = _solution(num_uavs, num_errors + 1, *given, *arrays)
     return [Gaussian(m, p) for m, p in zip(*every, strict=True)]
 

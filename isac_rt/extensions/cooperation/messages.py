@@ -195,9 +195,9 @@ class Notes(Stateful):
     def receive(self, message: Message) -> None:
         """Take down what is newer than what it knows."""
         sender = message.sender
-        for name, report_ in message.terminals.items():
-            if name != self.name and self._newer(report_.time, self.terminals.get(name)):
-                self.terminals[name] = replace(report_, via=sender)
+        for name, own_report in message.terminals.items():
+            if name != self.name and self._newer(own_report.time, self.terminals.get(name)):
+                self.terminals[name] = replace(own_report, via=sender)
         for origin, kept in message.kept.items():
             if self._newer(kept.time, self.kept.get(origin)):
                 self.kept[origin] = replace(kept, via=sender)
@@ -218,8 +218,8 @@ class Notes(Stateful):
         fused = self.fused_tracks.update(
             at_once((report for report, _ in self.reports.values()), time, acceleration_std),
             {
-                name: report_of(report_.state).after(time - report_.time, acceleration_std)
-                for name, report_ in self.terminals.items()
+                name: report_of(own_report.state).after(time - own_report.time, acceleration_std)
+                for name, own_report in self.terminals.items()
             },
         )
         for uav in fused:
@@ -313,10 +313,10 @@ class Sightings(Stateful):
 
     def receive(self, message: Message) -> None:
         """Take down what it does not know yet."""
-        for name, report_ in message.terminals.items():
+        for name, own_report in message.terminals.items():
             known = self.terminals.get(name)
-            if name != self.name and (known is None or report_.time > known.time):
-                self.terminals[name] = replace(report_, via=message.sender)
+            if name != self.name and (known is None or own_report.time > known.time):
+                self.terminals[name] = replace(own_report, via=message.sender)
         for scan in message.scans:
             if scan.key not in self.state.scans:
                 self._take(scan, message.sender)
@@ -328,8 +328,8 @@ class Sightings(Stateful):
         if tx == rx:
             self.tracker.add(scan, None)
         elif tx in self.terminals:
-            report_ = self.terminals[tx]
-            self.tracker.add(scan, _moved(report_.state.mean, scan.time - report_.time))
+            own_report = self.terminals[tx]
+            self.tracker.add(scan, _moved(own_report.state.mean, scan.time - own_report.time))
 
     def fuse(self, time: float, acceleration_std: float) -> list[Fused]:
         """Return the fused tracks at a time [s], without what was not said for `HOLD_S`."""
@@ -337,8 +337,8 @@ class Sightings(Stateful):
         self.state.terminals = {k: s for k, s in self.terminals.items() if time - s.time <= HOLD_S}
         self.tracker.forget(time)
         known = {
-            name: advance(report_.state, time - report_.time, acceleration_std)
-            for name, report_ in self.terminals.items()
+            name: advance(own_report.state, time - own_report.time, acceleration_std)
+            for name, own_report in self.terminals.items()
         }
         return self.tracker.at(time, known)
 

@@ -127,12 +127,11 @@ class Cooperation(Stateful):
     def _reported_uavs(self, name: str, view: View, time: float) -> list[ReportedUav]:
         """Return the targets that a terminal knows of: other terminals by their reports, and the
         fused tracks that are none of these."""
-        report_ = self._notes[name].terminals
-        reported_poses = [
+        terminals = [
             ReportedUav(other, advance(s.state, time - s.time, self._acceleration))
-            for other, s in report_.items()
+            for other, s in self._notes[name].terminals.items()
         ]
-        return reported_poses + [ReportedUav("", b.state) for b in view.fused if b.terminal is None]
+        return terminals + [ReportedUav("", b.state) for b in view.fused if b.terminal is None]
 
     def reports(self, link: Link, frame: int, time: float) -> list[ReportedUav]:
         """The UAVs that a link's receiver knew of after a frame, at a time [s], but the link's
@@ -157,7 +156,7 @@ class Cooperation(Stateful):
             for report, via in notes.reports.values()
             if not via
         ]
-        words = {name: report_of(report_) for name, report_ in known.items()}
+        words = {name: report_of(state) for name, state in known.items()}
         return self._swarm.update(at_once(own, time, self._acceleration), words)
 
     def _see(self, frame: int, link: Link, received: LinkResult) -> None:
@@ -171,10 +170,10 @@ class Cooperation(Stateful):
             clock = SPEED_OF_LIGHT * setup.connections.offset_std(link, time)
         notes = self._notes[link.rx]
         if isinstance(notes, Notes):
-            reported_to = (tracks.confirmed & ~tracks.is_reference).nonzero()[0]
+            confirmed = (tracks.confirmed & ~tracks.is_reference).nonzero()[0]
             cell = setup.waveform.range_cell(1)
             states = {
-                int(tracks.ids[k]): in_world(tracks, int(k), own, clock, cell) for k in reported_to
+                int(tracks.ids[k]): in_world(tracks, int(k), own, clock, cell) for k in confirmed
             }
             notes.see(str(link), time, states)
             return
@@ -207,46 +206,46 @@ class Cooperation(Stateful):
         """Let a frame pass over all channels; how many messages came to each terminal, and how many
         were lost."""
         came = dict.fromkeys(self._notes, Traffic())
-        for direction, capacity in self._capacities(frame).items():
-            channel = self.state.channels.setdefault(direction, Channel())
-            if direction in received:
-                read = received[direction].reception.decoded and _corrected(symbols[direction])
+        for link, capacity in self._capacities(frame).items():
+            channel = self.state.channels.setdefault(link, Channel())
+            if link in received:
+                read = received[link].reception.decoded and _corrected(symbols[link])
             else:
-                read = received[Link(direction.rx, direction.tx)].state == TerminalState.TRACKING
-            came[direction.rx] += Traffic(room=capacity)
+                read = received[Link(link.rx, link.tx)].state == TerminalState.TRACKING
+            came[link.rx] += Traffic(room=capacity)
             done = channel.carry(frame, capacity, read)
             if done is not None:
                 message, arrived = done
-                came[direction.rx] += Traffic(
+                came[link.rx] += Traffic(
                     1, not arrived, bits=message.bits, left_out=message.left_out
                 )
                 if arrived:
-                    self._notes[direction.rx].receive(message)
+                    self._notes[link.rx].receive(message)
         return came
 
     def _carry_late(
         self, late: Mapping[Link, Sequence[LateRecord]], came: dict[str, Traffic]
     ) -> None:
         """Add to `came` what arrives with frames that were read late."""
-        for direction, records in late.items():
+        for link, records in late.items():
             for one in records:
-                if direction in self.state.channels and _corrected(one.symbols):
-                    for message in self.state.channels[direction].late(one.frame):
-                        came[direction.rx] += Traffic(late=1)
-                        self._notes[direction.rx].receive(message)
+                if link in self.state.channels and _corrected(one.symbols):
+                    for message in self.state.channels[link].late(one.frame):
+                        came[link.rx] += Traffic(late=1)
+                        self._notes[link.rx].receive(message)
 
     def _send(self, frame: int) -> None:
         """Put new messages on the channels that are free; channels between terminals that have no
         link any more are closed."""
         if frame + 1 >= self._setup.timetable.frames:
             return
-        ways = self._capacities(frame + 1)
+        capacities = self._capacities(frame + 1)
         self.state.channels = {
-            direction: self.state.channels.get(direction, Channel()) for direction in ways
+            link: self.state.channels.get(link, Channel()) for link in capacities
         }
-        for direction, channel in self.state.channels.items():
-            if channel.message is None and ways[direction] > 0:
-                channel.send(self._notes[direction.tx].compose(direction.rx, ways[direction]))
+        for link, channel in self.state.channels.items():
+            if channel.message is None and capacities[link] > 0:
+                channel.send(self._notes[link.tx].compose(link.rx, capacities[link]))
 
 
 def _corrected(count: SymbolCount) -> bool:

@@ -104,7 +104,7 @@ def test_the_same_words_heard_again_count_once():
     assert np.allclose(again.covariance, a.covariance, rtol=1e-9)
 
 
-def reported_to(key, mean, variances, time=0.0, since=0.0, name=None):
+def track_report(key, mean, variances, time=0.0, since=0.0, name=None):
     state = Gaussian(np.array(mean, float), np.diag(np.array(variances, float)))
     key = Key(*key)
     return Report(key, since, name or Name(since, *key), time, state)
@@ -116,8 +116,8 @@ def test_two_terminals_that_see_from_two_sides_fix_a_body():
     lies where the sure axes cross, up to the weight of the unsure ones: 0.01 / 4.01 of 1.3 m."""
     fine, coarse = 0.01, 4.0
     rest = [0.04, 0.09, 0.09, 0.09]
-    south = reported_to(("S->S", 4), [31.3, 20.0, 12, 1, 2, 0], [coarse, fine, *rest])
-    west = reported_to(("S->W", 7), [30.0, 21.3, 12, 1, 2, 0], [fine, coarse, *rest])
+    south = track_report(("S->S", 4), [31.3, 20.0, 12, 1, 2, 0], [coarse, fine, *rest])
+    west = track_report(("S->W", 7), [30.0, 21.3, 12, 1, 2, 0], [fine, coarse, *rest])
     (uav,) = FusedTracks().update([south, west])
     assert set(uav.members) == {south.key, west.key}
     variance = 2 / (1 / fine + 1 / coarse)
@@ -129,17 +129,17 @@ def test_two_terminals_that_see_from_two_sides_fix_a_body():
 
 
 def test_bodies_farther_apart_than_their_errors_stay_two():
-    a = reported_to(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.01] * 6)
-    b = reported_to(("A->B", 1), [31, 20, 12, 1, 2, 0], [0.01] * 6)
+    a = track_report(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.01] * 6)
+    b = track_report(("A->B", 1), [31, 20, 12, 1, 2, 0], [0.01] * 6)
     assert len(FusedTracks().update([a, b])) == 2
 
 
 def test_a_track_that_could_be_anything_does_not_take_the_place_of_a_sure_one():
     """Both lie within the gate, the vague one at the lesser Mahalanobis distance. Its likelihood is
     far less. Planted bug: the determinant left out."""
-    uav = reported_to(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.01] * 6)
-    near = reported_to(("A->B", 1), [30.2, 20, 12, 1, 2, 0], [0.01] * 6)
-    vague = reported_to(("A->B", 2), [33, 20, 12, 1, 2, 0], [25.0] * 6)
+    uav = track_report(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.01] * 6)
+    near = track_report(("A->B", 1), [30.2, 20, 12, 1, 2, 0], [0.01] * 6)
+    vague = track_report(("A->B", 2), [33, 20, 12, 1, 2, 0], [25.0] * 6)
     found = FusedTracks().update([uav, near, vague])
     assert {frozenset(f.members) for f in found} == {
         frozenset({uav.key, near.key}),
@@ -151,11 +151,11 @@ def test_two_tracks_of_one_terminal_are_two_bodies_unless_uavs_cannot_be_so_near
     """With errors that would let each of them be the other: 0.6 m apart they are two UAVs, 0.4 m
     apart one, which is parted again over 1 m. A track of another terminal changes nothing. Planted
     bugs: one only if a single terminal sees them; never parted."""
-    a = reported_to(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.2] * 6)
-    other = reported_to(("A->B", 1), [30, 20, 12, 1, 2, 0], [0.2] * 6)
+    a = track_report(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.2] * 6)
+    other = track_report(("A->B", 1), [30, 20, 12, 1, 2, 0], [0.2] * 6)
 
     def beside(offset):
-        return reported_to(("A->A", 2), [30 + offset, 20, 12, 1, 2, 0], [0.2] * 6)
+        return track_report(("A->A", 2), [30 + offset, 20, 12, 1, 2, 0], [0.2] * 6)
 
     assert len(FusedTracks().update([a, beside(0.6)])) == 2
     for more in ([], [other]):
@@ -169,10 +169,10 @@ def test_two_tracks_of_one_terminal_are_two_bodies_unless_uavs_cannot_be_so_near
 def test_a_pair_is_parted_later_than_it_would_be_joined():
     """chi squared of six: 16.8 at 0.99, 38.3 at 1 - 1e-6. With variances of 0.01 each an offset d
     has d^2 / 0.02: 0.7 m is 24.5, which joins nobody and parts nobody, 0.9 m is 40.5."""
-    a = reported_to(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.01] * 6)
+    a = track_report(("A->A", 1), [30, 20, 12, 1, 2, 0], [0.01] * 6)
 
     def other(offset):
-        return reported_to(("A->B", 1), [30 + offset, 20, 12, 1, 2, 0], [0.01] * 6)
+        return track_report(("A->B", 1), [30 + offset, 20, 12, 1, 2, 0], [0.01] * 6)
 
     apart, together = FusedTracks(), FusedTracks()
     assert len(apart.update([a, other(0.7)])) == 2
@@ -185,8 +185,8 @@ def test_all_who_hear_of_the_earliest_track_call_the_body_by_it():
     """One listener hears the earlier track first, one the later one; a third comes after the
     earlier one has ended and has the name from who says the later one. Planted bug: the name of
     the first heard."""
-    early = reported_to(("A->A", 9), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.0)
-    late = reported_to(("A->B", 2), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5)
+    early = track_report(("A->A", 9), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.0)
+    late = track_report(("A->B", 2), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5)
     first, second = FusedTracks(), FusedTracks()
     first.update([early])
     second.update([late])
@@ -195,7 +195,9 @@ def test_all_who_hear_of_the_earliest_track_call_the_body_by_it():
         assert uav.name == Name(1.0, "A->A", 9)
         (uav,) = fused_tracks.update([late])
         assert uav.name == Name(1.0, "A->A", 9)
-    received = reported_to(("A->B", 2), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5, name=uav.name)
+    received = track_report(
+        ("A->B", 2), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5, name=uav.name
+    )
     (uav,) = FusedTracks().update([received])
     assert uav.name == Name(1.0, "A->A", 9)
 
@@ -203,8 +205,8 @@ def test_all_who_hear_of_the_earliest_track_call_the_body_by_it():
 def test_no_two_bodies_have_one_name():
     """A track that was part of a body leaves it and still brings the name along."""
     name = Name(1.0, "A->A", 9)
-    early = reported_to(("A->A", 9), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.0)
-    away = reported_to(("A->B", 2), [40, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5, name=name)
+    early = track_report(("A->A", 9), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.0)
+    away = track_report(("A->B", 2), [40, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5, name=name)
     found = FusedTracks().update([away, early])
     assert {f.members[0]: f.name for f in found} == {
         early.key: name,
@@ -222,7 +224,7 @@ def test_a_name_goes_back_to_the_body_with_its_track(order):
     fused_tracks = FusedTracks()
     fused_tracks.restore({"state": {"uavs": [uavs[i] for i in order]}})
     reports = [
-        reported_to(key, [50.0 * i, 0, 0, 0, 0, 0], [0.1] * 6, since=float(i), name=known[key])
+        track_report(key, [50.0 * i, 0, 0, 0, 0, 0], [0.1] * 6, since=float(i), name=known[key])
         for i, key in enumerate((a, b, c))
     ]
     names = {uav.members[0]: uav.name for uav in fused_tracks.update(reports)}
@@ -232,8 +234,8 @@ def test_a_name_goes_back_to_the_body_with_its_track(order):
 def test_a_terminal_is_known_by_what_it_says_of_itself():
     """The nearer in likelihood of two bodies; the other one stays a stranger."""
     itself = Gaussian(np.array([30.0, 20, 12, 1, 2, 0]), 0.0025 * np.eye(6))
-    echo = reported_to(("A->A", 1), [30.05, 20, 12, 1, 2, 0], [0.04] * 6)
-    beside = reported_to(("A->A", 2), [30.6, 20, 12, 1, 2, 0], [0.04] * 6)
+    echo = track_report(("A->A", 1), [30.05, 20, 12, 1, 2, 0], [0.04] * 6)
+    beside = track_report(("A->A", 2), [30.6, 20, 12, 1, 2, 0], [0.04] * 6)
     found = FusedTracks().update([beside, echo], {"P": report_of(itself)})
     assert {f.members[0]: f.terminal for f in found} == {echo.key: "P", beside.key: None}
 
@@ -392,18 +394,18 @@ def test_a_body_on_the_line_of_sight_is_told_with_nothing_known_along_it(aside):
     sender, uav = turn @ [0.0, 39.0, 0.0], turn @ [aside, 13.0, 0.0]
     tracks = tracked([*sender, 0, 0, 0], [*uav, 0, 0, 0], reference=0)
     own = Pose.at_rest((5.0, -3.0, 20.0))
-    reported_to = in_world(tracks, 1, own, clock_std=1.0, cell=0.47)
+    reported = in_world(tracks, 1, own, clock_std=1.0, cell=0.47)
     P, own_P = (
-        turn.T @ C[:3, :3] @ turn for C in (reported_to.state.covariance, tracks.covariance[1])
+        turn.T @ C[:3, :3] @ turn for C in (reported.state.covariance, tracks.covariance[1])
     )
     assert P[1, 1] > 100**2
     assert P[2, 2] == pytest.approx(own_P[2, 2], abs=1e-3)  # rounding of (200 km)^2 is 1e-5
-    assert turn.T @ reported_to.lever[:3, 9] == pytest.approx([0, 1 / 9, 0], abs=1e-3)
-    seen = Gaussian(reported_to.state.mean + 0.01, 0.01 * np.eye(6))
+    assert turn.T @ reported.lever[:3, 9] == pytest.approx([0, 1 / 9, 0], abs=1e-3)
+    seen = Gaussian(reported.state.mean + 0.01, 0.01 * np.eye(6))
     reports = [
         Report(Key(origin, 1), 0.0, Name(0.0, origin, 1), 0.0, state, lever)
         for origin, state, lever in (
-            ("A->B", reported_to.state, reported_to.lever),
+            ("A->B", reported.state, reported.lever),
             ("A->A", seen, np.zeros((6, ERRORS))),
         )
     ]
@@ -587,9 +589,9 @@ def test_errors_of_terminals_are_told_apart_whatever_else_is_common(seed):
 def test_a_lone_track_takes_its_old_name_along():
     """B's track was A's body, which A has lost; another one finds it again. Planted bug: the name
     left behind when bodies join."""
-    early = reported_to(("A->C", 9), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.0)
-    late = reported_to(("A->A", 2), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5)
-    newest = reported_to(("A->B", 7), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=3.0)
+    early = track_report(("A->C", 9), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.0)
+    late = track_report(("A->A", 2), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=1.5)
+    newest = track_report(("A->B", 7), [30, 20, 12, 1, 2, 0], [0.01] * 6, since=3.0)
     fused_tracks = FusedTracks()
     fused_tracks.update([early, late])
     fused_tracks.update([late])

@@ -279,11 +279,11 @@ def test_detections_are_passed_on_but_not_back():
 
 def test_paths_over_a_transmitter_that_says_nothing_place_nobody():
     """B's paths are of A's chirps: with A's word for where it is they are bodies."""
-    silent, reported_to = sightings("B"), sightings("B")
-    reported_to.receive(sightings("A").compose("B", 10**5))
-    for one in (silent, reported_to):
+    silent, receiving = sightings("B"), sightings("B")
+    receiving.receive(sightings("A").compose("B", 10**5))
+    for one in (silent, receiving):
         one.see(replace(scan(0, "A->B"), own=Pose.at_rest((0, 20, 20), (0, -1, 0))))
-    assert len(silent.fuse(T, 3.0)) == 0 and len(reported_to.fuse(T, 3.0)) == 2
+    assert len(silent.fuse(T, 3.0)) == 0 and len(receiving.fuse(T, 3.0)) == 2
 
 
 def test_sightings_go_on_from_memory():
