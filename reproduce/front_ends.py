@@ -30,7 +30,6 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.active import receive_active
-from isac_rt.receive.arms import arm
 from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.settings import Receivers
 from isac_rt.signal.methods import Direct
@@ -269,16 +268,13 @@ def _late(own: Built, w: Waveform) -> float:
 
 
 def _slope(own: Built, antennas: Antennas, w: Waveform) -> tuple[float, float]:
-    """What the phases of the channels add to (u_x, u_z): their regression over the arm of the
-    virtual L from which the receiver takes each. An element at r turns the IF by -k r u."""
+    """What the phases of the channels add to (u_x, u_z): their regression over the virtual
+    channels. An element at r turns the IF by -k r u."""
     phase = np.zeros((antennas.num_tx, antennas.num_rx))
     if own.transmit is not None:
         phase += np.angle(own.transmit.gain)[:, None]
     if own.receive is not None:
         phase += np.angle(own.receive.gain)
-    out = []
-    for axis in (0, 2):
-        line = arm(antennas, axis)
-        place = 2 * pi / w.wavelength * line.places[:, axis]
-        out.append(float(np.polyfit(place, -phase[line.tx, line.rx], 1)[0]))
-    return out[0], out[1]
+    place = 2 * pi / w.wavelength * antennas.virtual_positions[:, [0, 2]]
+    slope = np.linalg.lstsq(place - place.mean(axis=0), -phase.ravel(), rcond=None)[0]
+    return float(slope[0]), float(slope[1])

@@ -388,9 +388,9 @@ OF_CASES = {
         "rate = 30.0 / (w.frame_duration * w.effective_carrier)",
     ),
     "scatter of directions": Bug(
-        "receive/estimate.py",
-        "apart = known.wavenumber * line.places[: values.shape[2], axis]",
-        "apart = 1.02 * known.wavenumber * line.places[: values.shape[2], axis]",
+        "receive/directions.py",
+        "        phases = wavenumber * places\n",
+        "        phases, wavenumber = 1.02 * wavenumber * places, 1.02 * wavenumber\n",
     ),
     "processing gain": Bug("frame/level.py", "- 2 * 10 * np.log10(1.5)", "- 10 * np.log10(1.5)"),
     "standing clutter is removed": Bug(

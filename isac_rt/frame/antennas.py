@@ -52,6 +52,14 @@ def centred(places: Places) -> np.ndarray:
     return positions
 
 
+def folded(cosines: npt.ArrayLike, turns: npt.ArrayLike) -> np.ndarray:
+    """Direction cosines (..., 2), or differences of some, less the multiples of `turns` (2,) that
+    they are nearest to (`Antennas.turns`)."""
+    u = np.asarray(cosines)
+    finite = np.where(np.isfinite(turns), turns, 0.0)
+    return np.asarray(u - finite * np.round(u / turns))
+
+
 def unit_vector(cosines: npt.ArrayLike) -> np.ndarray:
     """Body-frame unit vectors (..., 3) of direction cosines (u_x, u_z) (..., 2) in the front
     half-space; outside the unit disc the Y component is 0."""
@@ -166,20 +174,11 @@ class Antennas:
         element: the sums of both ends' places."""
         return (self.tx_positions[:, None] + self.rx_positions[None]).reshape(-1, 3)
 
-    def step(self, passes: int) -> float:
-        """Least distance [m] along X between the channels of an echo (passes = 2) or the receive
-        elements, beyond whose half wavelengths directions are ambiguous; 0 where there is none."""
-        if self.is_l:
-            return self.spacing
-        places = self.virtual_positions if passes == 2 else self.rx_positions
-        apart = np.diff(np.sort(places[:, 0]))
-        apart = apart[apart > SAME_PLACE_M]
-        return float(apart.min()) if apart.size else 0.0
-
-    def turn(self, wavelength: float, passes: int) -> float:
-        """Span of direction cosines that the array tells apart; inf: all."""
-        step = self.step(passes)
-        return wavelength / step if step else np.inf
+    def turns(self, wavelength: float, passes: int) -> np.ndarray:
+        """(2,) shifts of u_x and u_z that turn no channel of an echo (passes = 2) or no receive
+        element against another: the wavelength over the step of which all their distances along
+        the axis are multiples. inf: none."""
+        return wavelength * _turns(self, passes)
 
     def observes(self, passes: int) -> tuple[bool, bool]:
         """Return whether directions along X and along Z are observable: the channels of an echo
@@ -223,6 +222,20 @@ def _observes(antennas: Antennas, passes: int) -> tuple[bool, bool]:
     places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
     span = np.ptp(places, axis=0)
     return bool(span[0] > SAME_PLACE_M), bool(span[2] > SAME_PLACE_M)
+
+
+@lru_cache(maxsize=64)
+def _turns(antennas: Antennas, passes: int) -> np.ndarray:
+    """`Antennas.turns` of a wavelength of 1 m: the steps by Euclid's algorithm."""
+    places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
+    steps = np.zeros(2)
+    for axis, along in enumerate(places[:, [0, 2]].T):
+        for apart in along - along.min():
+            while apart > SAME_PLACE_M:
+                rest = steps[axis] % apart
+                steps[axis], apart = apart, rest if apart - rest > SAME_PLACE_M else 0.0
+    with np.errstate(divide="ignore"):
+        return 1 / steps
 
 
 def _places_of(elements: Elements | None, waveform: Waveform, cascade: int) -> Places | None:
@@ -287,14 +300,16 @@ def resolutions(waveform: Waveform, antennas: Antennas, passes: int) -> np.ndarr
     cells = [waveform.range_cell(passes), waveform.velocity_cell(passes)]
     if not antennas.is_l:
         places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
-        return np.array([*cells, *(waveform.wavelength / _aperture(places[:, i]) for i in (0, 2))])
+        return np.array(
+            [*cells, *(waveform.wavelength / aperture_of(places[:, i]) for i in (0, 2))]
+        )
     across = antennas.rx_x * (antennas.tx_x if passes == 2 else 1)
     up = antennas.rx_z * (antennas.tx_z if passes == 2 else 1)
     step = waveform.wavelength / antennas.spacing
     return np.array([*cells, step / across, step / up])
 
 
-def _aperture(along: np.ndarray) -> float:
+def aperture_of(along: np.ndarray) -> float:
     """Length [m] of an array with elements at `along` (L,): from the first to the last and one mean
     step more, which is n d of a filled row; next to nothing where all stand at one place."""
     steps = np.unique(np.round(along / SAME_PLACE_M)).size - 1

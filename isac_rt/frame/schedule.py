@@ -88,16 +88,23 @@ def _hadamard_rows(num_tx: int, size: int) -> tuple[int, ...]:
     return tuple(rows)
 
 
+def leaks(waveform: Waveform) -> np.ndarray:
+    """(B, L_tx, L_tx) amplitude by which the channel of an antenna (axis 1) shows the echo of each
+    one (axis 2) so many B-th parts of the span of velocities above its own, of antennas that send
+    at once; B = 1 where they take turns."""
+    codes = codes_of(waveform)
+    if codes is None:
+        return np.eye(waveform.num_tx)[None]
+    period = codes[:, : waveform.bands]
+    lines = np.fft.fft(period * period[:, None].conj(), axis=-1) / waveform.bands
+    return np.moveaxis(lines, -1, 0)
+
+
 def images(waveform: Waveform) -> np.ndarray:
     """(B,) power of a path on the map that is added over all channels, in each of the B bands, over
     that of one channel in the right one: L_tx in band 0, and less in the others unless velocities
-    are ambiguous; of antennas that take turns all are there, or 1 where B is 1."""
-    codes = codes_of(waveform)
-    if codes is None:
-        return np.array([float(waveform.num_tx)])
-    period = codes[:, : waveform.bands]
-    lines = np.fft.fft(period[:, None] * period.conj(), axis=-1) / waveform.bands
-    return np.asarray((np.abs(lines) ** 2).sum(axis=(0, 1)))
+    are ambiguous."""
+    return np.asarray((np.abs(leaks(waveform)) ** 2).sum(axis=(1, 2)))
 
 
 def unambiguous_share(waveform: Waveform) -> float:

@@ -417,16 +417,6 @@ class Array(Node):
         """L_rx, receive elements."""
         return self.rx_x + self.rx_z - 1 if self.rx is None else self.rx.count(sending=False)
 
-    @property
-    def is_l(self) -> bool:
-        """True if both arrays are an L."""
-        return self.tx is None and self.rx is None
-
-    @property
-    def is_full_l(self) -> bool:
-        """True if both arrays are an L whose receive arms observe directions on both axes."""
-        return self.is_l and self.rx_x > 1 and self.rx_z > 1
-
     def applies(self, name: str) -> bool:
         if name in ("pattern", "pattern_file"):
             return self.element_pattern == "table"

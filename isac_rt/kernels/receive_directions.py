@@ -18,8 +18,6 @@ LEAST_WEIGHT = 1e-3
 """Scatterers weaker in a cell than this share of the noise are left out of its covariance."""
 TOGETHER = 8
 """Scatterers that are added to a covariance at once."""
-TIE = 1e-9
-"""Share by which a direction must be stronger: both ends of the axis may be the same one."""
 
 
 @jit(borrows=True)
@@ -63,15 +61,15 @@ def line_bounds(maps, channels, spectra, out):
 @jit(fast=True)
 def search_directions(along_x, along_z, turns_z, turns_x, inside, scale, peak, place):
     """`isac_rt.receive.directions.search_directions`, sixteen directions at once."""
-    looks, size, lines = along_x.shape[1], along_x.shape[3], along_z.shape[2]
-    turns, each, power = turns_z.reshape(-1), scale.reshape(-1), np.empty(size * size, np.float32)
+    looks, count, lines, size = along_x.shape[1], along_x.shape[3], *along_z.shape[2:]
+    turns, each, power = turns_z.reshape(-1), scale.reshape(-1), np.empty(count * size, np.float32)
     channels_read, zero = np.empty(looks * 2 * lines * size, np.float32), splat(np.float32(0))
     sine, line = turns_z.shape[1] * size, 2 * lines * size
     for s in range(along_x.shape[0]):
         norm = min(s, scale.shape[0] - 1) * power.size
         for t in range(looks):
             _apart(along_z[s, t], channels_read[t * line : (t + 1) * line])
-        for i in range(size):
+        for i in range(count):
             for j in range(0, size, LANES):
                 total = zero
                 for t in range(looks):
@@ -91,9 +89,9 @@ def search_directions(along_x, along_z, turns_z, turns_x, inside, scale, peak, p
         best = _largest(power, inside)
         peak[s] = power[best]
         for axis, step in enumerate((size, 1)):
-            at = best // step % size
+            at = best // size if axis == 0 else best % size
             place[s, axis] = at
-            if 0 < at < size - 1:
+            if 0 < at < (count if axis == 0 else size) - 1:
                 _between(power[best - step], power[best], power[best + step], s, axis, peak, place)
 
 
@@ -143,7 +141,7 @@ class Axis(NamedTuple):
     ----------
     ends : (lines + 1,) where the channels of each line begin and end
     cosines, sines : (G, n) of exp(+j k v u) along the lines
-    turns : (2, lines, G), the same of the lines' places on the other axis
+    turns : (2, lines, H), the same of the lines' places on the other axis
     """
 
     ends: np.ndarray
@@ -159,15 +157,15 @@ def quadratic_forms(matrices, order, x, z, out):
     Within the lines along an axis a form depends on one cosine alone; what couples an X with a Z
     line is a product of both spectra.
     """
-    count, size, pair = order.size, x.cosines.shape[0], 2 * LANES
+    count, pair, wide, high = order.size, 2 * LANES, x.cosines.shape[0], z.cosines.shape[0]
     num_x, num_z = x.cosines.shape[1], z.cosines.shape[1]
     two, least = np.float32(2), splat(np.float32(1e-6))
     channels_read = np.empty(count * count * pair, np.float32)
-    total = np.empty(size * size * LANES, np.float32)
+    total = np.empty(wide * high * LANES, np.float32)
     near, flat = np.empty(num_z * pair, np.float32), out.reshape(-1)
-    far = np.empty((2, x.ends.size - 1, size, num_z), np.float32)
+    far = np.empty((2, x.ends.size - 1, high, num_z), np.float32)
     for p in range(x.ends.size - 1):
-        for j in range(size):
+        for j in range(high):
             c, d = x.turns[0, p, j], x.turns[1, p, j]
             for n in range(num_z):
                 far[0, p, j, n] = c * z.cosines[j, n] + d * z.sines[j, n]
@@ -181,9 +179,9 @@ def quadratic_forms(matrices, order, x, z, out):
                     value, at = matrix[order[m], order[n]], (n * count + m) * pair + s
                     channels_read[at], channels_read[at + LANES] = value.real, value.imag
         total[:] = 0.0
-        _within(channels_read, count, 0, x, total, size, 1)
-        _within(channels_read, count, num_x, z, total, 1, size)
-        for i in range(size):
+        _within(channels_read, count, 0, x, total, high, 1)
+        _within(channels_read, count, num_x, z, total, 1, high)
+        for i in range(wide):
             for p in range(x.ends.size - 1):
                 for r in range(z.ends.size - 1):
                     c, d = splat(two * z.turns[0, r, i]), splat(two * z.turns[1, r, i])
@@ -191,18 +189,18 @@ def quadratic_forms(matrices, order, x, z, out):
                         re, im = _sum(channels_read, count, num_x + n, x, p, 0, i)
                         store(near, n * pair, re * c + im * d)
                         store(near, n * pair + LANES, im * c - re * d)
-                for j in range(size):
-                    at = (i * size + j) * LANES
+                for j in range(high):
+                    at = (i * high + j) * LANES
                     value = load(total, at)
                     for n in range(num_z):
                         a, b = load(near, n * pair), load(near, n * pair + LANES)
                         value = value + a * splat(far[0, p, j, n]) - b * splat(far[1, p, j, n])
                     store(total, at, value)
-        for at in range(0, size * size, LANES):
+        for at in range(0, wide * high, LANES):
             transpose(total, at * LANES)
             for s in range(here):
                 value = larger(load(total, (at + s) * LANES), least)
-                store(flat, (first + s) * size * size + at, value)
+                store(flat, (first + s) * wide * high + at, value)
 
 
 @jit(fast=True, borrows=True)
@@ -221,8 +219,7 @@ def _sum(channels_read, count, n, lines, p, begin, g):
 def _within(channels_read, count, begin, lines, total, step, other):
     """Add what an axis' own lines, whose channels begin at `begin`, have of `quadratic_forms`;
     `step` and `other` are those from one of their own directions to the next, and across."""
-    size = lines.cosines.shape[0]
-    for g in range(size):
+    for g in range(lines.cosines.shape[0]):
         for p in range(lines.ends.size - 1):
             for q in range(lines.ends.size - 1):
                 re, im = splat(np.float32(0)), splat(np.float32(0))
@@ -230,7 +227,7 @@ def _within(channels_read, count, begin, lines, total, step, other):
                     a, b = _sum(channels_read, count, begin + n, lines, p, begin, g)
                     c, d = splat(lines.cosines[g, n]), splat(lines.sines[g, n])
                     re, im = re + a * c + b * d, im + b * c - a * d
-                for h in range(size):
+                for h in range(lines.turns.shape[2]):
                     a, b = lines.turns[0, p, h], lines.turns[1, p, h]
                     c, d = lines.turns[0, q, h], lines.turns[1, q, h]
                     at = (g * step + h * other) * LANES
@@ -302,49 +299,3 @@ def _add_products(re, im, count, size, sums):
                 c, d = c + a * x + b * y, d + b * x - a * y
             store(flat, at, c)
             store(flat, other, d)
-
-
-@jit
-def strongest(values, apart, limit, count, fine, out):
-    """`isac_rt.receive.estimate.fill_strongest`."""
-    for q in range(out.size):
-        out[q] = _strongest(values[q], apart, limit, count, fine)
-
-
-@jit
-def _strongest(values, apart, limit, count, fine):
-    """Direction cosine of the most power, of `count` from -limit to `limit`, and `fine` about the
-    best of them by parabolas through the logarithm; `values` (T, L) of elements at `apart`
-    [rad]."""
-    step = 2 * limit / (count - 1)
-    turn, move = np.exp(-1j * limit * apart), np.exp(1j * step * apart)
-    best, most = -limit, -1.0
-    for i in range(count):
-        power = _beam(values, turn)
-        if power > most * (1 + TIE):
-            best, most = -limit + i * step, power
-        turn *= move
-    for part in (2.0, 12.0, 60.0):
-        if not fine:
-            break
-        near = step / part
-        low = np.log(max(_beam(values, np.exp(1j * (best - near) * apart)), 1e-300))
-        mid = np.log(max(_beam(values, np.exp(1j * best * apart)), 1e-300))
-        high = np.log(max(_beam(values, np.exp(1j * (best + near) * apart)), 1e-300))
-        curve = low - 2 * mid + high
-        up = 0.5 * (low - high) / curve * near if curve < 0 else near * np.sign(high - low)
-        best += min(max(up, -2 * near), 2 * near)
-    return best
-
-
-@jit(borrows=True)
-def _beam(values, turn):
-    """Power of the rows of `values` (T, L), each turned by `turn` and added in phase."""
-    power = 0.0
-    for t in range(values.shape[0]):
-        re, im = 0.0, 0.0
-        for i in range(turn.size):
-            re += values[t, i].real * turn[i].real - values[t, i].imag * turn[i].imag
-            im += values[t, i].real * turn[i].imag + values[t, i].imag * turn[i].real
-        power += re * re + im * im
-    return power

@@ -1,5 +1,5 @@
-"""Virtual channels of the L: which antennas go together, where their phase centres lie, and when a
-spherical wave reaches them."""
+"""Virtual channels of an array: where their phase centres lie, and when a spherical wave reaches
+them."""
 
 from __future__ import annotations
 
@@ -34,22 +34,6 @@ class Channels:
         """(K, L) exp(-j k v.u) of paths from body directions (K, 3), at the frequency of the
         window's middle."""
         return np.exp(-1j * known.wavenumber * (cosines @ self.places.T))
-
-
-@lru_cache(maxsize=32)
-def arm(antennas: Antennas, axis: int, passes: int = 2) -> Channels:
-    """Channels along X (axis 0) or Z (axis 2) of the L: transmit and receive elements of the axis
-    together for an echo, whose places add; for one pass the receive arm with every transmit
-    antenna, whose direction of departure is another."""
-    a = antennas
-    rx = np.arange(a.rx_x) if axis == 0 else np.arange(a.rx_x - 1, a.num_rx)
-    along = np.arange(a.tx_x) if axis == 0 else np.arange(a.tx_x - 1, a.num_tx)
-    tx = along if passes == 2 else np.arange(a.num_tx)
-    t, r = (i.ravel() for i in np.meshgrid(tx, rx, indexing="ij"))
-    places = a.rx_positions[r] + (a.tx_positions[t] if passes == 2 else 0.0)
-    for array in (t, r, places):
-        array.setflags(write=False)
-    return Channels(t, r, places)
 
 
 @lru_cache(maxsize=32)

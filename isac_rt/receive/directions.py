@@ -11,37 +11,40 @@ terminal the transmit antennas are the looks, for nobody knows the direction in 
 Where there is noise alone R = 1, and a bound on the sum over the lines of the array spares most
 cells the search.
 
-Every line of channels along an axis answers to one direction cosine, and its phase against the
-others to the other one, so that the search is separable: with F_l the spectrum of line l along X
-and G_l along Z,
+The channels may stand anywhere in the plane. Every line of them along an axis answers to one
+direction cosine, and its phase against the others to the other one, so that the search is
+separable: with F_l the spectrum of line l along X and G_l along Z,
 
 .. math:: a^H y = \sum_l e^{jkz_lu_z} F_l(u_x) + \sum_l e^{jkx_lu_x} G_l(u_z).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import SAME_PLACE_M, Antennas, aperture_of, folded
 from isac_rt.kernels import hermitian, receive_directions
 from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.receive_directions import Axis
 from isac_rt.kernels.vector import LANES
 from isac_rt.receive.arms import Channels, all_channels
 
-DIRECTIONS = 32
-"""Values of each direction cosine that are searched; the peak between them is sought from there."""
+STEPS_OF_A_BEAM, MOST_DIRECTIONS = 4, 1024
+"""Directions searched within a resolution (wavelength over aperture) on each axis, half as many
+where all together were more than that; the peak between them is sought from there."""
 PRUNED = 0.9
 """Share of the lower threshold below which a cell is not looked at further: between directions of
 the grid a parabola misses a tenth of a peak at most."""
 CLIMBED = 0.3, 0.12
 """Steps, in those of the grid, by which the peak between them is climbed."""
-FINE = 0.03, 0.01, 0.003
-"""Steps of the search for a direction around a beam [cosine]."""
+STENCILS = 0.15, 0.06, 0.03, 0.03
+"""Half widths of the stencils on which a peak is fitted [resolutions]."""
+AROUND = np.stack(np.meshgrid([0, -1, 1], [0, -1, 1], indexing="ij"), axis=-1).reshape(-1, 2)
+"""The nine points of a stencil."""
 
 
 @dataclass(frozen=True)
@@ -52,70 +55,100 @@ class Lines:
     ----------
     members : of each line the numbers of its channels
     spectra : of each line (G, n) complex64, exp(+j k v u) along it
-    turns : (lines, G) complex64, exp(+j k v u) of its place on the other axis
+    turns : (lines, H) complex64, exp(+j k v u) of its place on the other axis
     """
 
     members: tuple[np.ndarray, ...]
     spectra: tuple[np.ndarray, ...]
     turns: np.ndarray
 
+    @classmethod
+    def of(
+        cls, places: np.ndarray, number: np.ndarray, u: tuple[np.ndarray, np.ndarray], axis: int
+    ) -> Lines:
+        """The lines along an axis of channels at `places` (L, 2) [rad per unit cosine], each in
+        the line of its `number`, -1: in none."""
+        members = tuple(np.flatnonzero(number == n) for n in np.unique(number[number >= 0]))
+        spectra = [np.exp(1j * np.outer(u[axis], places[m, axis])) for m in members]
+        other = np.array([places[m[0], 1 - axis] for m in members])
+        turns = np.exp(1j * np.outer(other, u[1 - axis])).astype(np.complex64)
+        return cls(members, tuple(s.astype(np.complex64) for s in spectra), turns)
+
 
 @dataclass(frozen=True)
 class Search:
-    """Grid and refinement of a search for directions over a set of channels.
+    """Grid and refinement of a search for directions over a set of channels, anywhere in a plane.
 
     Attributes
     ----------
     channels : Channels
-    cosines : (G,) values of each direction cosine
+    cosines : (G,) values of u_x and (H,) of u_z, even in number, H a multiple of `LANES`; all 0 on
+        an axis that the channels do not observe
     along_x, along_z : Lines
-    inside : (G, G) bool, directions (u_x, u_z) of the unit disc
+    inside : (G, H) bool, directions (u_x, u_z) of the unit disc
     wavenumber : [rad/m]
+    turns : (2,) of `Antennas.turns`
+    beam : (2,) resolution, 0 on an axis that the channels do not observe
     """
 
     channels: Channels
-    cosines: np.ndarray
+    cosines: tuple[np.ndarray, np.ndarray]
     along_x: Lines
     along_z: Lines
     inside: np.ndarray
     wavenumber: float
+    turns: np.ndarray
+    beam: np.ndarray
 
     @classmethod
-    def of(cls, channels: Channels, wavenumber: float, limit: float) -> Search:
-        """Directions within `limit` on both axes."""
-        u = limit * (2 * np.arange(DIRECTIONS) + 1 - DIRECTIONS) / DIRECTIONS
-        places = channels.places[:, [0, 2]]
+    def of(cls, channels: Channels, wavenumber: float, limit: float, turns: np.ndarray) -> Search:
+        """Directions within `limit` on both axes, or within the half turn that the array tells
+        apart."""
+        places, limits = channels.places[:, [0, 2]], np.minimum(limit, turns / 2)
+        seen = np.ptp(places, axis=0) > SAME_PLACE_M
+        aperture = np.array([aperture_of(along) for along in places.T])
+        beam = np.where(seen, 2 * np.pi / (wavenumber * aperture), 0.0)
+        for step in (beam / STEPS_OF_A_BEAM, 2 * beam / STEPS_OF_A_BEAM):
+            u = x, z = tuple(_grid(*of) for of in zip(limits, step, strict=True))
+            if x.size * z.size <= MOST_DIRECTIONS:
+                break
         # a channel belongs to the longer of the two lines through it
-        x, z = places.T
-        on_x = _sizes(z) >= _sizes(x)
-        make = []
-        for axis, some in ((0, on_x), (1, ~on_x)):
-            rows = [
-                np.flatnonzero(some & (np.abs(places[:, 1 - axis] - c) < 1e-9))
-                for c in np.unique(np.round(places[some, 1 - axis], 9))
-            ]
-            spectra = [
-                np.exp(1j * wavenumber * np.outer(u, places[r, axis])).astype(np.complex64)
-                for r in rows
-            ]
-            turns = [np.exp(1j * wavenumber * u * places[r[0], 1 - axis]) for r in rows]
-            shape = len(rows), DIRECTIONS
-            make.append(
-                Lines(tuple(rows), tuple(spectra), np.array(turns, np.complex64).reshape(shape))
-            )
-        return cls(channels, u, make[0], make[1], np.add.outer(u**2, u**2) <= 1, wavenumber)
+        row, column = (_numbers(along) for along in places.T[::-1])
+        on_x = np.bincount(row)[row] >= np.bincount(column)[column]
+        phases = wavenumber * places
+        along_x = Lines.of(phases, np.where(on_x, row, -1), u, 0)
+        along_z = Lines.of(phases, np.where(on_x, -1, column), u, 1)
+        inside = np.add.outer(x**2, z**2) <= 1
+        return cls(channels, u, along_x, along_z, inside, wavenumber, turns, beam)
+
+    @property
+    def steps(self) -> np.ndarray:
+        """(2,) of the grid."""
+        return np.array([u[1] - u[0] for u in self.cosines])
+
+    @property
+    def observed(self) -> np.ndarray:
+        """(2,) bool, axes that the channels observe."""
+        return self.beam > 0
 
     def steering(self, cosines: np.ndarray) -> np.ndarray:
         """(..., L) complex64 exp(-j k v.u) of directions (..., 2)."""
         return turned(-self.wavenumber * (cosines @ self.channels.places[:, [0, 2]].T))
 
+    def reading(self, cosines: np.ndarray) -> np.ndarray:
+        """Directions (..., 2) by the nearest to boresight of those that the channels do not tell
+        apart; NaN beyond the horizon, and on an axis that they do not observe."""
+        u = folded(cosines, self.turns)
+        real = (u**2).sum(axis=-1, keepdims=True) <= 1
+        return np.where(real & self.observed, u, np.nan)
+
     @cached_property
     def axes(self) -> tuple[np.ndarray, Axis, Axis]:
         """Numbers of the channels line by line, first those along X, and both axes' lines."""
         axes = []
-        for lines in (self.along_x, self.along_z):
+        for u, lines in zip(self.cosines, (self.along_x, self.along_z), strict=True):
             ends = np.cumsum([0, *(len(m) for m in lines.members)])
-            spectra = np.concatenate([np.zeros((DIRECTIONS, 0), np.complex64), *lines.spectra], 1)
+            spectra = np.concatenate([np.zeros((u.size, 0), np.complex64), *lines.spectra], 1)
             cosines, sines = np.stack([spectra.real, spectra.imag])
             turns = np.stack([lines.turns.real, lines.turns.imag])
             axes.append(Axis(ends, cosines, sines, turns))
@@ -126,10 +159,10 @@ class Search:
     def scalloping(self) -> float:
         """By how much a wave half a step off the grid on both axes exceeds, in amplitude, the sum
         of what the lines have of it on the grid."""
-        half = self.wavenumber * (self.cosines[1] - self.cosines[0]) / 2
+        half = self.wavenumber * self.steps / 2
         kept = [
-            abs(np.exp(1j * half * self.channels.places[members, axis]).sum())
-            for axis, lines in ((0, self.along_x), (2, self.along_z))
+            abs(np.exp(1j * half[axis] * self.channels.places[members, 2 * axis]).sum())
+            for axis, lines in enumerate((self.along_x, self.along_z))
             for members in lines.members
         ]
         return len(self.channels) / float(sum(kept))
@@ -141,14 +174,29 @@ class Search:
         return (np.sinc(apart[..., 0]) * np.sinc(apart[..., 2])).astype(np.float32)
 
     def lines(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Spectra of the lines along X and Z (S, T, lines, G) of channels (S, T, L)."""
+        """Spectra of the lines along X (S, T, lines, G) and Z (S, T, lines, H) of channels (S, T,
+        L)."""
         out, each = [], y.reshape(-1, y.shape[2])
-        for lines in (self.along_x, self.along_z):
-            made = np.empty((len(each), len(lines.members), DIRECTIONS), np.complex64)
+        for u, lines in zip(self.cosines, (self.along_x, self.along_z), strict=True):
+            made = np.empty((len(each), len(lines.members), u.size), np.complex64)
             for k, (members, spectra) in enumerate(zip(lines.members, lines.spectra, strict=True)):
                 made[:, k] = each[:, members] @ spectra.T
             out.append(made.reshape(*y.shape[:2], *made.shape[1:]))
         return out[0], out[1]
+
+
+def _grid(limit: float, step: float) -> np.ndarray:
+    """Values of a direction cosine within a limit at a step or less, which may be a tenth more; a
+    multiple of `LANES`, all 0 without a step."""
+    if step == 0:
+        return np.zeros(LANES)
+    size = LANES * max(int(np.ceil(2 * limit / step / LANES - 0.1)), 1)
+    return limit * (2 * np.arange(size) + 1 - size) / size
+
+
+def _numbers(along: np.ndarray) -> np.ndarray:
+    """Number the lines of channels at `along` across them [m]."""
+    return np.unique(np.round(along / SAME_PLACE_M), return_inverse=True)[1]
 
 
 def turned(phases: np.ndarray) -> np.ndarray:
@@ -160,23 +208,25 @@ def turned(phases: np.ndarray) -> np.ndarray:
     return out
 
 
-def _sizes(values: np.ndarray) -> np.ndarray:
-    """Count for each value how many are equal to it."""
-    return (np.abs(values[:, None] - values) < 1e-9).sum(axis=1)
+@lru_cache(maxsize=16)
+def search_of(antennas: Antennas, wavenumber: float, passes: int, limit: float = 1.0) -> Search:
+    """The search over all channels of an echo, or over the receivers for one pass."""
+    channels = all_channels(antennas)
+    if passes == 1:
+        rx = np.arange(antennas.num_rx)
+        channels = Channels(np.zeros_like(rx), rx, antennas.rx_positions)
+    turns = antennas.turns(2 * np.pi / wavenumber, passes)
+    return Search.of(channels, wavenumber, limit, turns)
 
 
-@lru_cache(maxsize=8)
 def channel_search(antennas: Antennas, wavenumber: float) -> Search:
-    """The search over all channels of an echo."""
-    return Search.of(all_channels(antennas), wavenumber, antennas.view_limit)
+    """The search over all channels of an echo within the field of view."""
+    return search_of(antennas, wavenumber, 2, antennas.view_limit)
 
 
-@lru_cache(maxsize=8)
 def receiver_search(antennas: Antennas, wavenumber: float) -> Search:
-    """The search over the receivers."""
-    rx = np.arange(antennas.num_rx)
-    channels = Channels(np.zeros_like(rx), rx, antennas.rx_positions)
-    return Search.of(channels, wavenumber, antennas.view_limit)
+    """The search over the receivers within the field of view."""
+    return search_of(antennas, wavenumber, 1, antennas.view_limit)
 
 
 @dataclass(frozen=True)
@@ -219,8 +269,8 @@ def search_plain(x: np.ndarray, search: Search, noise: float, least: float) -> F
     peak, cosines = bound**2 * raised, np.full((cell.size, 2), np.nan)
     some = np.flatnonzero(peak >= least)
     y = np.ascontiguousarray(x[:, :, some].transpose(2, 0, 1))
-    whole = np.full((1, DIRECTIONS, DIRECTIONS), scale, np.float32)
-    peak[some], cosines[some] = on_grid(y, whole, search)
+    whole = np.full((1, *search.inside.shape), scale, np.float32)
+    peak[some], cosines[some] = strongest_on_grid(y, whole, search)
     above = peak[some] >= least
     some = some[above]
     statistic = statistic_of(y[above], scale=scale)
@@ -233,10 +283,10 @@ def _axis_bound(x: np.ndarray, search: Search) -> np.ndarray:
     along Z; `line_bounds` lets each line have its own."""
     out = np.zeros(x.shape[2], np.float32)
     for lines in (search.along_x, search.along_z):
-        total = np.zeros((DIRECTIONS, x.shape[2]), np.float32)
+        total = np.zeros((1, x.shape[2]), np.float32)
         for members, spectra in zip(lines.members, lines.spectra, strict=True):
             beams = [spectra @ look[members] for look in x]
-            total += np.sqrt(sum(beam.real**2 + beam.imag**2 for beam in beams))
+            total = total + np.sqrt(sum(beam.real**2 + beam.imag**2 for beam in beams))
         out += total.max(axis=0)
     return out
 
@@ -256,7 +306,7 @@ def search_white(
     """
     inverse = inverses(R)
     y = np.matmul(x, inverse.transpose(0, 2, 1))
-    peak, cosines = on_grid(y, 1 / denominators(inverse, search), search)
+    peak, cosines = strongest_on_grid(y, 1 / denominators(inverse, search), search)
     some = np.flatnonzero(peak >= least)
     statistic = statistic_of(y[some], inverse[some])
     peak[some], cosines[some] = climbed(statistic, cosines[some], search)
@@ -282,34 +332,78 @@ def statistic_of(
 
 
 def climbed(
-    statistic: Callable[[np.ndarray], np.ndarray],
-    cosines: np.ndarray,
-    search: Search,
-    steps: Sequence[float] | None = None,
-    reach: int = 1,
+    statistic: Callable[[np.ndarray], np.ndarray], cosines: np.ndarray, search: Search
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest statistic near directions (S, 2), and where: a parabola between grid
     points may overshoot and lie beside the peak, and what counts is the statistic itself.
 
-    Parameters
-    ----------
-    statistic : of steering vectors (S, D, L), (S, D)
-    steps : of the places that are tried, shrinking [cosine]; None: `CLIMBED`
-    reach : steps to each side
+    `statistic` is of steering vectors (S, D, L), (S, D).
     """
-    if steps is None:
-        steps = [part * float(search.cosines[1] - search.cosines[0]) for part in CLIMBED]
     peak, each = np.zeros(len(cosines), np.float32), np.arange(len(cosines))
     towards = search.steering(cosines)
-    near = sorted(range(-reach, reach + 1), key=abs)
-    around = np.stack(np.meshgrid(near, near, indexing="ij"), axis=-1).reshape(-1, 2)
-    for step in steps:
-        turns = search.steering(step * around)  # the phases of two directions add
+    for part in CLIMBED:
+        step = part * search.steps
+        turns = search.steering(step * AROUND)  # the phases of two directions add
         values = statistic(towards[:, None] * turns)
         best = values.argmax(axis=1)
-        peak, cosines = values[each, best], cosines + step * around[best]
+        peak, cosines = values[each, best], cosines + step * AROUND[best]
         towards = towards * turns[best]
     return peak, cosines
+
+
+def settled(
+    statistic: Callable[[np.ndarray], np.ndarray], cosines: np.ndarray, search: Search
+) -> np.ndarray:
+    """Return the directions (S, 2) of the largest statistic near some, by Newton's steps on
+    paraboloids through its logarithm; parameters as for `climbed`."""
+    u = np.array(cosines, float)
+    for half in STENCILS:
+        values = statistic(search.steering(u[:, None] + half * search.beam * AROUND))
+        most = values.max(axis=1, keepdims=True).astype(float)
+        g = np.log(np.maximum(values / np.maximum(most, 1e-300), 1e-6)).reshape(-1, 3, 3)
+        slope = np.stack([g[:, 2, 0] - g[:, 1, 0], g[:, 0, 2] - g[:, 0, 1]], axis=1) / 2
+        bend = np.stack([g[:, 1:, 0].sum(axis=1), g[:, 0, 1:].sum(axis=1)], axis=1)
+        bend = np.where(search.observed, bend - 2 * g[:, :1, 0], -1.0)
+        mixed = (g[:, 2, 2] - g[:, 2, 1] - g[:, 1, 2] + g[:, 1, 1]) / 4
+        det = bend.prod(axis=1) - mixed**2
+        peaked = (bend < 0).all(axis=1) & (det > 0)
+        move = (mixed[:, None] * slope[:, ::-1] - bend[:, ::-1] * slope) / det.clip(1e-30)[:, None]
+        move = np.where(peaked[:, None], move, np.sign(slope))  # beside the peak: uphill
+        u += half * search.beam * np.clip(move, -3, 3)
+    return u
+
+
+def strongest(y: np.ndarray, search: Search, *, on_grid: bool = False) -> np.ndarray:
+    """Return the directions (S, 2) in which channels (S, T, L), in phase over L and in power over
+    T, have most, which is the maximum-likelihood estimate of one wave in white noise.
+
+    NaN on an axis that is not observed, and beyond the horizon. `on_grid`: the nearest of eight
+    directions to a resolution.
+    """
+    level = np.sqrt((np.abs(y) ** 2).mean(axis=(1, 2), keepdims=True))
+    y = (y / np.maximum(level, 1e-300)).astype(np.complex64)
+    u = strongest_on_grid(y, np.ones((1, *search.inside.shape), np.float32), search)[1]
+    u = settled(statistic_of(y), u, search)
+    if on_grid:
+        step = np.where(search.observed, search.beam / 8, 1.0)
+        u = np.round(u / step) * step
+    return search.reading(u)
+
+
+@lru_cache(maxsize=16)
+def direction_bound(antennas: Antennas, passes: int, wavenumber: float) -> np.ndarray:
+    r"""(2, 2) Cramer-Rao bound of u_x and u_z of one wave at unit SNR of all channels together,
+    infinite where an axis is not observed.
+
+    The inverse of :math:`2 k^2 C`, with C the covariance of the channels' places.
+    """
+    places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
+    axes = np.flatnonzero(antennas.observes(passes))
+    out = np.diag([np.inf, np.inf])
+    if axes.size:
+        fisher = 2 * wavenumber**2 * np.cov(places[:, 2 * axes].T, bias=True)
+        out[np.ix_(axes, axes)] = np.linalg.inv(np.atleast_2d(fisher))
+    return out
 
 
 def line_bounds(x: np.ndarray, channels: np.ndarray, spectra: np.ndarray) -> np.ndarray:
@@ -355,8 +449,8 @@ def fill_inverses(matrices: np.ndarray, out: np.ndarray) -> None:
 
 
 def denominators(matrix: np.ndarray, search: Search) -> np.ndarray:
-    """a^H Q a of all directions: (S, G, G) float32 from Hermitian matrices Q (S, L, L)."""
-    out = np.empty((len(matrix), DIRECTIONS, DIRECTIONS), np.float32)
+    """a^H Q a of all directions: (S, G, H) float32 from Hermitian matrices Q (S, L, L)."""
+    out = np.empty((len(matrix), *search.inside.shape), np.float32)
     quadratic_forms(np.ascontiguousarray(matrix, np.complex64), *search.axes, out)
     return out
 
@@ -365,7 +459,7 @@ def denominators(matrix: np.ndarray, search: Search) -> np.ndarray:
 def quadratic_forms(
     matrices: np.ndarray, order: np.ndarray, x: Axis, z: Axis, out: np.ndarray
 ) -> None:
-    """Fill a^H Q a of all directions (S, G, G), at least 1e-6, from Hermitian matrices Q (S, L, L)
+    """Fill a^H Q a of all directions (S, G, H), at least 1e-6, from Hermitian matrices Q (S, L, L)
     of channels which `order` sorts: those of the lines along X, then those along Z."""
     parts = []
     for axis, other in ((x, "ij"), (z, "ji")):
@@ -379,15 +473,17 @@ def quadratic_forms(
     out[:] = np.maximum(forms.real, 1e-6)
 
 
-def on_grid(y: np.ndarray, scale: np.ndarray, search: Search) -> tuple[np.ndarray, np.ndarray]:
-    """Largest sum of |a^H y|^2 over the looks of y (S, T, L) times a scale (S or 1, G, G), and its
+def strongest_on_grid(
+    y: np.ndarray, scale: np.ndarray, search: Search
+) -> tuple[np.ndarray, np.ndarray]:
+    """Largest sum of |a^H y|^2 over the looks of y (S, T, L) times a scale (S or 1, G, H), and its
     direction, interpolated."""
     peak, place = np.zeros(len(y), np.float32), np.zeros((len(y), 2), np.float32)
     _, x, z = search.axes
-    inside, u = search.inside.ravel().astype(np.float32), search.cosines
+    inside, first = search.inside.ravel().astype(np.float32), [u[0] for u in search.cosines]
     lines = search.lines(y)
     search_directions(*lines, x.turns, z.turns, inside, scale.astype(np.float32), peak, place)
-    return peak, u[0] + place * (u[1] - u[0])
+    return peak, first + place * search.steps
 
 
 @twin_of(receive_directions.search_directions)
@@ -406,21 +502,20 @@ def search_directions(
 
     Parameters
     ----------
-    along_x, along_z : (S, T, lines, G) complex64 spectra of the lines
-    turns_z, turns_x : (2, lines, G) cosines and sines of the lines' places on the other axis
-    inside : (G G) 1 for directions of the unit disc, else 0
-    scale : (S or 1, G, G) of the power summed over the looks
+    along_x, along_z : (S, T, lines, G) and (S, T, lines, H) complex64 spectra of the lines
+    turns_z, turns_x : (2, lines, H or G) cosines and sines of the lines' places on the other axis
+    inside : (G H) 1 for directions of the unit disc, else 0
+    scale : (S or 1, G, H) of the power summed over the looks
     peak, place : (S,) and (S, 2) float32
     """
     beams = np.einsum("stki,kj->stij", along_x, turns_z[0] + 1j * turns_z[1])
     beams = beams + np.einsum("stkj,ki->stij", along_z, turns_x[0] + 1j * turns_x[1])
     power = (np.abs(beams) ** 2).sum(axis=1) * scale
-    size = power.shape[1]
-    best = (power.reshape(-1, size * size) * inside).argmax(axis=1)
-    for s, at in enumerate(zip(*np.divmod(best, size), strict=True)):
+    best = (power.reshape(len(power), -1) * inside).argmax(axis=1)
+    for s, at in enumerate(zip(*np.divmod(best, power.shape[2]), strict=True)):
         peak[s], place[s] = power[s][at], at
         for axis, line in enumerate((power[s][:, at[1]], power[s][at[0]])):
-            if 0 < at[axis] < size - 1:
+            if 0 < at[axis] < line.size - 1:
                 three = np.maximum(line[at[axis] - 1 : at[axis] + 2], 1e-20)
                 low, _, high = np.log(three / three[1])
                 if low + high < 0:

@@ -24,13 +24,18 @@ import numpy as np
 
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.kernels import receive_directions, receive_estimate
+from isac_rt.kernels import receive_estimate
 from isac_rt.kernels.jit import twin_of
-from isac_rt.kernels.receive_directions import TIE
 from isac_rt.kernels.receive_estimate import STENCIL, Chirps, WindowAxis
 from isac_rt.kernels.vector import LANES, aligned, unset
-from isac_rt.receive import planar
-from isac_rt.receive.arms import arm, element_delays
+from isac_rt.receive.arms import element_delays
+from isac_rt.receive.directions import (
+    direction_bound,
+    search_of,
+    settled,
+    statistic_of,
+    strongest,
+)
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import slow_window
 from isac_rt.receive.modes import MODES, mode_shapes
@@ -436,61 +441,6 @@ class Estimator:
 OFF_GRID = Estimator()
 
 
-def cosines_along(
-    channels: np.ndarray, known: Known, axis: int, *, on_grid: bool = False
-) -> np.ndarray:
-    """Return direction cosines (Q,) along one axis of the L from channel responses (Q, L_tx, L_rx),
-    by maximising the beamformed power.
-
-    An element at r answers with exp(-j 2 pi f r u / c), f the frequency at the window's middle.
-    Echoes are combined coherently over both arrays; one-way paths coherently over the
-    receivers and in power over the transmitters, whose direction of departure is another and
-    ambiguous.
-    """
-    a, echo, line = known.antennas, known.passes == 2, arm(known.antennas, axis, known.passes)
-    if not a.observes(known.passes)[axis // 2]:
-        return np.full(len(channels), np.nan)
-    limit = min(1.0, np.pi / (known.wavenumber * a.spacing))
-    rows = 1 if echo else a.num_tx
-    values = channels[:, line.tx, line.rx].reshape(len(channels), rows, len(line) // rows)
-    # the receivers stand alike for every transmitter
-    apart = known.wavenumber * line.places[: values.shape[2], axis]
-    count = 8 * (a.rx_x if axis == 0 else a.rx_z) * (2 if echo else 1) + 1
-    best = np.empty(len(channels))
-    fill_strongest(values, apart, limit, count, not on_grid, best)
-    return np.where(np.abs(best) <= 1, best, np.nan)
-
-
-@twin_of(receive_directions.strongest)
-def fill_strongest(
-    values: np.ndarray, apart: np.ndarray, limit: float, count: int, fine: bool, out: np.ndarray
-) -> None:
-    """Fill the direction cosines (Q,) of the most power of values (Q, T, L), in phase over elements
-    at `apart` [rad per unit cosine] and in power over T.
-
-    The first of the largest of `count` from -limit to `limit`, as both ends may be the same
-    direction; `fine` about it by parabolas through the logarithms of three powers, at steps that
-    shrink.
-    """
-
-    def power(u: np.ndarray) -> np.ndarray:
-        beams = np.einsum("qtl,qgl->qtg", values, np.exp(1j * u[..., None] * apart))
-        return (np.abs(beams) ** 2).sum(axis=1)
-
-    grid = np.linspace(-limit, limit, count)
-    most, step = power(np.tile(grid, (len(values), 1))), 2 * limit / (count - 1)
-    first = (most >= most.max(axis=1, keepdims=True) / (1 + TIE)).argmax(axis=1)
-    out[:] = grid[first]
-    for part in (2.0, 12.0, 60.0) if fine else ():
-        near = step / part
-        three = power(out[:, None] + near * np.array([-1, 0, 1]))
-        low, mid, high = np.log(np.maximum(three, 1e-300)).T
-        curve = low - 2 * mid + high
-        top = 0.5 * (low - high) / np.where(curve < 0, curve, 1) * near
-        up = np.where(curve < 0, top, near * np.sign(high - low))
-        out += np.clip(up, -2 * near, 2 * near)
-
-
 def direction_cosines(estimate: Estimate, known: Known, *, on_grid: bool = False) -> list[float]:
     """u_x and u_z of a detection (`directions`)."""
     delay = np.array([estimate.delay])
@@ -522,13 +472,25 @@ def directions(
 
 
 def _cosines(channels: np.ndarray, known: Known, *, on_grid: bool) -> np.ndarray:
-    """(Q, 2) u_x and u_z of plane waves: by the arms of an L one by one, or by all channels."""
-    if not known.antennas.is_l:
-        found = [planar.cosines(one, known, on_grid=on_grid) for one in channels]
-        return np.array(found, float).reshape(-1, 2)
-    return np.stack(
-        [cosines_along(channels, known, axis, on_grid=on_grid) for axis in (0, 2)], axis=1
-    )
+    """(Q, 2) u_x and u_z of plane waves, by all channels of an echo, or by the receivers, added in
+    power over the transmitters, whose direction of departure is another."""
+    search = search_of(known.antennas, known.wavenumber, known.passes)
+    y = channels.reshape(-1, 1, known.channels) if known.passes == 2 else channels
+    return strongest(y, search, on_grid=on_grid)
+
+
+def near_beam(
+    estimate: Estimate, known: Known, cosines: np.ndarray, inverse: np.ndarray | None = None
+) -> np.ndarray:
+    """(u_x, u_z) near a beam of the largest likelihood, with R^-1 (L, L) or in noise alone
+    (`Search.reading`)."""
+    search = search_of(known.antennas, known.wavenumber, known.passes, known.antennas.view_limit)
+    y = estimate.channels[None]
+    if known.passes == 2:
+        y = y.reshape(1, 1, -1)
+    white = y if inverse is None else y @ inverse.T
+    statistic = statistic_of(white, None if inverse is None else inverse[None])
+    return search.reading(settled(statistic, cosines[None], search)[0])
 
 
 def in_plane(u: np.ndarray, known: Known) -> np.ndarray:
@@ -596,16 +558,6 @@ def standard_deviations(
         np.hypot(np.maximum(tone, 2e-3), pull) * known.range_cell,
         np.hypot(np.maximum(tone, 4e-3), pull) * w.velocity_cell(known.passes),
     ]
-    if not known.antennas.is_l:
-        variance = [np.diag(planar.direction_covariance(t, known)) for t in np.ravel(total)]
-        angles = np.maximum(np.sqrt(np.reshape(variance, (-1, 2))), 2e-4)
-        return np.concatenate([np.stack(spread, axis=-1), angles.reshape(*total.shape, 2)], axis=-1)
-    for axis, observed in zip((0, 2), known.antennas.observes(known.passes), strict=True):
-        if not observed:
-            spread.append(np.full(total.shape, np.inf))
-            continue
-        place = arm(known.antennas, axis, known.passes).places[:, axis]
-        slope = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT * max(place.std(), 1e-6)
-        share = place.size / known.channels
-        spread.append(np.maximum(1 / (slope * np.sqrt(2 * total * share)), 2e-4))
+    bound = np.diag(direction_bound(known.antennas, known.passes, known.wavenumber))
+    spread += [np.maximum(np.sqrt(variance / total), 2e-4) for variance in bound]
     return np.stack(spread, axis=-1)

@@ -18,6 +18,7 @@ from isac_rt.frame.schedule import (
     codes_of,
     decoded_schedule,
     is_latin,
+    leaks,
     unambiguous_share,
 )
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
@@ -37,6 +38,7 @@ class Known:
     passes : 2 for echoes at the active terminal, 1 at a passive one (`Link.passes`)
     unambiguous_share : of the velocities of a chirp in every slot, that the codes of antennas that
         send at once leave unambiguous
+    code_leaks : of `schedule.leaks`, of antennas that sent at once; else None
     """
 
     waveform: Waveform
@@ -46,6 +48,7 @@ class Known:
     antennas: Antennas
     passes: int
     unambiguous_share: float = 1.0
+    code_leaks: np.ndarray | None = None
 
     @classmethod
     def of(cls, cube: IFCube, payload: Payload, antennas: Antennas, passes: int) -> Known:
@@ -68,7 +71,7 @@ class Known:
         if codes is None:
             return spectra, self
         known = Known.unmodulated(w.decoded, decoded_schedule(w), self.antennas, self.passes)
-        known = replace(known, unambiguous_share=unambiguous_share(w))
+        known = replace(known, unambiguous_share=unambiguous_share(w), code_leaks=leaks(w))
         return spectra * codes.conj().astype(np.complex64)[:, None, None], known
 
     def alike(self, other: Known) -> bool:
@@ -100,6 +103,24 @@ class Known:
         """True if the groups together sample every antenna in every slot."""
         num_tx = self.waveform.num_tx
         return len(self.schedule) == num_tx and is_latin(self.schedule, num_tx)
+
+    @cached_property
+    def leaks(self) -> np.ndarray:
+        """(K, L_tx, L_tx) amplitude by which an antenna's channel shows each one's echo, k K-ths of
+        the Doppler span above its own, over that of chirps in every slot. Antennas that take turns
+        in order see their own echoes K = L_tx times, turned by the slot in which they begin; other
+        sparse schedules spread them over all velocities, which is left out."""
+        num_tx = self.waveform.num_tx
+        if self.code_leaks is not None:
+            return self.code_leaks
+        if self.full:
+            return np.eye(num_tx)[None]
+        first = self.schedule[:, :num_tx]
+        if (self.schedule != np.tile(first, self.schedule.shape[1] // num_tx)).any():
+            return np.eye(num_tx)[None] * len(first) / num_tx
+        slot = np.argsort(first, axis=1)  # (M, L_tx) of each antenna
+        turn = np.exp(-2j * np.pi * np.arange(num_tx)[:, None, None] * slot / num_tx)
+        return turn.sum(axis=1)[:, None] * np.eye(num_tx) / num_tx
 
     @cached_property
     def times(self) -> np.ndarray:

@@ -165,6 +165,17 @@ class Banded(LatinUnion):
         return above & (np.abs(doppler_bins(w) + 0.25) < share * w.num_chirps / 2)
 
 
+def in_their_span(statistic: np.ndarray, spans: int) -> np.ndarray:
+    """Mark the cells (rows, P) whose neighbourhood holds no less than those that lie whole spans of
+    velocities off, of so many in which antennas that share the chirps show an echo: all channels
+    agree on a direction in the right one alone."""
+    around = ndimage.maximum_filter(statistic, 3, mode=("nearest", "wrap"))
+    held = statistic > 0
+    for k in range(1, spans):
+        held &= around >= np.roll(around, k * statistic.shape[1] // spans, axis=1)
+    return held
+
+
 @twin_of(receive_maps.make_maps)
 def make_maps(
     flat: np.ndarray,

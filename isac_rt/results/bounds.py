@@ -11,7 +11,7 @@ from scipy.special import erf
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive.planar import direction_bound
+from isac_rt.receive.directions import direction_bound
 from isac_rt.results.metrics import Truth
 
 

@@ -22,7 +22,6 @@ from pydantic import (
     ModelWrapValidatorHandler,
     PrivateAttr,
     TypeAdapter,
-    ValidationError,
     model_validator,
 )
 
@@ -207,7 +206,6 @@ class Scenario(Node):
             self._fmcw_access_problems,
             self._fmcw_array_problems,
             self._fmcw_receiver_problems,
-            self._array_problems,
             self._swarm_problems,
             self._role_problems,
             self._access_problems,
@@ -342,7 +340,6 @@ class Scenario(Node):
             usual = {
                 "velocity_method": ("auto",),
                 "refinement": ("local", "grid"),
-                "clutter_detector": ("cfar",),
                 "clutter_filter": ("none", "zero_doppler"),
             }
         elif r.scheme == "tdm":
@@ -360,28 +357,6 @@ class Scenario(Node):
         """The scenario's own receivers and those compared with them, by their keys."""
         sets: dict[Key, Receivers] = {("receivers",): self.receivers}
         return sets | {("compare", n, "receivers"): x.receivers for n, x in self.compare.items()}
-
-    def _array_problems(self) -> Iterator[Problem]:
-        """Receivers that look at the arms of an L one by one, beside other arrays."""
-        if self.array.is_full_l:
-            return
-        able = {
-            "clutter_detector": ("cfar",),
-            "passive_detector": ("cfar",),
-            "refinement": ("local", "grid"),
-            "symbol_decision": ("powers",),
-            "link_acquisition": ("pilots",),
-        }
-        for at, receivers in self._all_receivers().items():
-            unlike = {k: v for k, v in able.items() if not _fits(k, getattr(receivers, k), v)}
-            if unlike:
-                named = " and ".join(f"{key}: {getattr(receivers, key)}" for key in unlike)
-                use = ", ".join(f"{key}: {values[0]}" for key, values in unlike.items())
-                yield Problem(
-                    (*((*at, key) for key in unlike), ("array",)),
-                    f"{named} needs an L with two receive arms, and the arrays are another; set "
-                    f"{use}, or leave array.tx and array.rx out",
-                )
 
     def _swarm_problems(self) -> Iterator[Problem]:
         active = [name for name, uav in self.swarm.items() if uav.role == "active"]
@@ -654,17 +629,9 @@ def _with_presets(data: Any) -> Any:
 def _usual_preset(data: dict[str, Any]) -> Preset:
     """The preset of a file that states none. What is malformed is `plain`, for whoever checks
     it."""
-    city, model, mode, array = (
-        _plain(data.get(k)) for k in ("city", "propagation", "radio", "array")
-    )
+    city, model = (_plain(data.get(key)) for key in ("city", "propagation"))
     traced = isinstance(model, dict) and model.get("model") == "ray_traced"
-    isac = not isinstance(mode, dict) or mode.get("mode", "isac") == "isac"
-    if city is None or not traced or not isac:
-        return "plain"
-    try:
-        return "city" if Array.model_validate(array or {}).is_full_l else "plain"
-    except ValidationError:
-        return "plain"
+    return "city" if city is not None and traced else "plain"
 
 
 def _plain(value: Any) -> Any:

@@ -160,7 +160,7 @@ def _link_coverage(
     w, passes = timetable.waveform, link.passes
     cell, velocity, across, up = resolutions(w, antennas, passes).tolist()
     sideways, upwards = antennas.observes(passes)
-    apart = SPEED_OF_LIGHT / (float(w.carrier()) * max(antennas.step(passes), 1e-9))
+    apart = antennas.turns(SPEED_OF_LIGHT / float(w.carrier()), passes)[0]
     return LinkCoverage(
         link=str(link),
         max_range_m=w.num_range_cells * cell,

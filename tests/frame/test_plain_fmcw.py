@@ -141,7 +141,6 @@ def test_what_contradicts_itself_is_refused(tmp_path, override, said):
         (["radio.scheme=ddm", "radio.sub_bands=2"], "do not hold the 3"),
         (["radio.scheme=ddm", "radio.sub_bands=5"], "not a multiple of the 5 sub_bands"),
         (["radio.scheme=ddm", "receivers.refinement=joint"], "not made for mode fmcw"),
-        (["radio.scheme=ddm", "receivers.clutter_detector=angle_doppler"], "not made for"),
     ],
 )
 def test_codes_that_do_not_fit_are_refused(tmp_path, overrides, said):

@@ -8,9 +8,9 @@ import pytest
 from isac_rt.frame.antennas import Antennas, ti_cascade
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.directions import direction_bound, search_of, strongest
 from isac_rt.receive.estimate import Estimate, direction_cosines, standard_deviations
 from isac_rt.receive.known import Known
-from isac_rt.receive.planar import cosines, direction_covariance
 
 LAMBDA = 299792458 / 77e9
 
@@ -60,11 +60,11 @@ def test_errors_reach_the_cramer_rao_bound(array, passes):
         pytest.skip("the cascade's receivers stand in a row")
     u, total = (0.31, -0.12), 10 ** (2.3 if array != "sparse" else 2.6)
     std = np.sqrt(a.num_tx * a.num_rx / total / 2)
-    found = np.empty((300, 2))
-    for i in range(len(found)):
-        noise = rng.standard_normal((2, a.num_tx, a.num_rx)) * std
-        found[i] = cosines(waves(a, k, u, rng) + noise[0] + 1j * noise[1], k)
-    bound = direction_covariance(total, k)
+    drawn = rng.standard_normal((300, a.num_tx, a.num_rx, 2)) @ [1, 1j] * std
+    channels = drawn + [waves(a, k, u, rng) for _ in drawn]
+    search = search_of(a, k.wavenumber, passes)
+    found = strongest(channels.reshape(300, 1, -1) if passes == 2 else channels, search)
+    bound = direction_bound(a, passes, k.wavenumber) / total
     scale = np.sqrt(np.diag(bound))
     assert (np.abs(found.mean(axis=0) - u) < 4 * scale / np.sqrt(300)).all()
     ratio = np.cov(found.T) / np.outer(scale, scale)
@@ -77,7 +77,7 @@ def test_bound_of_a_row_by_hand():
     k = known(ROW, 2)
     gamma, n = 200.0, 8
     by_hand = 6 / (gamma * (k.wavenumber * LAMBDA / 2) ** 2 * (n**2 - 1))
-    bound = direction_covariance(gamma, k)
+    bound = direction_bound(ROW, 2, k.wavenumber) / gamma
     assert bound[0, 0] == pytest.approx(by_hand)
     assert np.isinf(bound[1, 1]) and bound[0, 1] == 0
 
@@ -104,13 +104,3 @@ def test_a_row_says_that_it_sees_no_elevation(kind):
     assert u[0] == pytest.approx(0.25, abs=1e-5) and np.isnan(u[1])
     std = standard_deviations(100.0, 0.0, k)
     assert np.isfinite(std[:3]).all() and np.isinf(std[3])
-
-
-def test_scan_in_parts_is_the_scan(monkeypatch):
-    """Many looks are taken in parts; bug: the last part left out."""
-    k = known(PLANAR, 2)
-    channels = waves(PLANAR, k, (-0.5, 0.55), np.random.default_rng(2))
-    whole = cosines(channels, k, on_grid=True)
-    monkeypatch.setattr("isac_rt.receive.planar.MOST_KEPT", 0)
-    monkeypatch.setattr("isac_rt.receive.planar.CHUNK", 1000)
-    assert cosines(channels, k, on_grid=True) == whole

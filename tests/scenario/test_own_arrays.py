@@ -103,16 +103,6 @@ def test_what_is_no_file_is_one_message(tmp_path):
         (["array.rx={shape: linear, positions: [[0, 0]]}"], "no meaning with shape linear"),
         (["array.rx.positions=[[0, 0, 0]]"], "at most 2"),
         (["array.rx={shape: planar, columns: 64, rows: 64}"], "more than 1024"),
-        (["array.rx.shape=ti_cascade", "receivers.refinement=joint"], "needs an L"),
-        (
-            ["array.rx.shape=linear", "receivers.clutter_detector=angle_doppler"],
-            "angle_doppler needs an L with two receive arms",
-        ),
-        (
-            ["array.rx.shape=linear", "receivers={refinement: joint, passive_detector: beams}"],
-            "passive_detector: beams and refinement: joint needs an L",
-        ),
-        (["array.rx_z=1", "array.tx_z=1", "receivers.refinement=joint"], "needs an L"),
         (["sensor=awr9"], "sensor"),
         (["array.tx={shape: linear, columns: 5}"], "48 chirps are not a multiple"),
     ],

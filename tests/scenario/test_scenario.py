@@ -615,24 +615,24 @@ def test_presets_fill_in_what_is_not_stated(tmp_path):
 
 
 def test_the_city_preset_is_the_default_where_paths_are_traced_in_a_city(tmp_path):
-    """And nowhere else: open space, free space, plain radars and other arrays keep `plain`; what a
-    file states of a detector takes the preset's keys along that mean nothing beside it. Planted
-    bugs: the preset by the city alone; the rates of the preset left beside a stated detector."""
+    """With any array, and nowhere else: open space and free space keep `plain`; what a file states
+    of a detector takes the preset's keys along that mean nothing beside it. Planted bugs: the
+    preset by the city alone; the rates of the preset left beside a stated detector."""
     traced = BASE + "city: {source: canyon}\npropagation: {model: ray_traced}\n"
 
     def read(text: str) -> Scenario:
         (tmp_path / "s.yaml").write_text(text)
         return load(tmp_path / "s.yaml")
 
-    found = read(traced)
-    assert found.receivers.passive_detector == "beams"
-    assert found.receivers.false_alarm_rates == (1e-4, 1e-6)
-    assert found.tracking.births == "unexplained"
+    for array in ("", "array: {rx_z: 1}\n", "array: {rx: {shape: planar, rows: 2}}\n"):
+        found = read(traced + array)
+        assert found.receivers.passive_detector == "beams"
+        assert found.receivers.false_alarm_rates == (1e-4, 1e-6)
+        assert found.tracking.births == "unexplained"
     others = (
         BASE,
         BASE + "city: {source: canyon}\n",
         traced + "receiver_preset: plain\n",
-        traced + "array: {rx_z: 1}\n",
     )
     for text in others:
         kept = read(text)

@@ -31,8 +31,8 @@ from functools import lru_cache
 import numpy as np
 from scipy import ndimage, optimize, special
 
-from isac_rt.receive.arms import Channels
 from isac_rt.receive.cfar import CfarRule, strong_lobes
+from isac_rt.receive.directions import Search
 from isac_rt.receive.settings import Receivers
 
 LEAST_CLUTTER = 0.03
@@ -40,17 +40,16 @@ LEAST_CLUTTER = 0.03
 alone."""
 
 
-def scanned(
-    channels: Channels, wavenumber: float, limit: float
-) -> tuple[tuple[float, float], float]:
-    """Sides of the directions within `limit` on both axes over the correlation length, and their
-    area over the correlation area.
+def scanned(search: Search) -> tuple[tuple[float, float], float]:
+    """Sides of the searched directions over the correlation length, and their area over the
+    correlation area; 0 on an axis that the channels do not observe.
 
     The correlation length along an axis is 1 / (k s), s the deviation of the channels' places.
     """
-    covariance = wavenumber**2 * np.cov(channels.places[:, [0, 2]].T, bias=True)
-    x, z = 2 * limit * np.sqrt(np.diag(covariance))
-    return (float(x), float(z)), float((2 * limit) ** 2 * np.sqrt(np.linalg.det(covariance)))
+    covariance = search.wavenumber**2 * np.cov(search.channels.places[:, [0, 2]].T, bias=True)
+    width = search.steps * [u.size for u in search.cosines]
+    x, z = width * np.sqrt(np.diag(covariance))
+    return (float(x), float(z)), float(width.prod() * np.sqrt(max(np.linalg.det(covariance), 0.0)))
 
 
 def expected_count(t: float, lengths: tuple[float, ...], area: float, looks: int = 1) -> float:

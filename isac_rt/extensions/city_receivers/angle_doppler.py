@@ -25,7 +25,6 @@ from isac_rt.extensions.city_receivers.neighbours import phases
 from isac_rt.extensions.city_receivers.power import TAPER, Taper, expected_power
 from isac_rt.extensions.city_receivers.waves import Wave, waves_of
 from isac_rt.frame.antennas import resolutions
-from isac_rt.receive.arms import all_channels
 from isac_rt.receive.cfar import (
     LOBE_MARGIN,
     first_row,
@@ -33,20 +32,17 @@ from isac_rt.receive.cfar import (
     strongest_peaks,
 )
 from isac_rt.receive.directions import (
-    FINE,
     PRUNED,
     Found,
     Search,
     channel_search,
-    climbed,
     inverses,
     search_plain,
     search_white,
-    statistic_of,
 )
-from isac_rt.receive.estimate import OFF_GRID, Estimate, Estimator, LocalSpectra
+from isac_rt.receive.estimate import OFF_GRID, Estimator, LocalSpectra, in_plane, near_beam
 from isac_rt.receive.known import Known
-from isac_rt.receive.maps import UNION_FLOOR, accumulate, maps_with_power
+from isac_rt.receive.maps import UNION_FLOOR, accumulate, in_their_span, maps_with_power
 from isac_rt.receive.sense import Sensed, describe
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import NO_HINTS, Correction, Detections, ExpectedClutter, Hints
@@ -58,8 +54,8 @@ TWO_WAVES = 0.5
 """Where no clutter is expected an echo starts no track if other waves in its cell have more than
 this share of its power: over a wall on one way alone two equal waves arrive. A wall that a UAV
 flies by adds less, in a canyon 0.1 to 0.2 of the UAV's echo."""
-
-
+MOST_KEPT = 50_000_000
+"""Entries of covariances that are held at once."""
 REPEAT_CELLS = 3.0
 """Cells of the range and the velocity window's main lobe on each side, and one for migration."""
 
@@ -119,7 +115,9 @@ class AngleDoppler:
         found, direction, cells, waves = [], [], [], []
         for cell in zip(rows.tolist(), bins.tolist(), strict=True):
             for wave in self._waves(maps, known, tested, cell):
-                beam = BeamSpectra(spectra, known, cell[0], on_antennas(wave.weights, known))
+                beam = BeamSpectra(
+                    spectra, known, cell[0], wave.weights.reshape(known.antennas.num_tx, -1)
+                )
                 estimate = wave.alone(self.estimator.at(beam, ratio, *cell), search)
                 found.append(estimate)
                 towards = wave.cosines
@@ -132,19 +130,21 @@ class AngleDoppler:
         share, number = np.array(waves).reshape(-1, 2).T
         snr = share * np.maximum(power[rows, bins] / tested.level[rows, bins], ratio[rows, bins])
         detections = describe(found, snr, known, on_grid=self.estimator.on_grid, mixed=TWO_WAVES)
-        detections = replace(detections, direction=np.array(direction).reshape(-1, 2))
+        towards, limit = np.array(direction).reshape(-1, 2), known.antennas.view_limit
+        towards = np.where(np.abs(towards) <= limit, towards, np.nan)
+        detections = replace(detections, direction=towards)
         # where there is no clutter a UAV's echo is one wave
         in_clutter = np.array([cell in tested.whiteners for cell in cells], bool)
         starts = (share * tested.sure[rows, bins] > 1) & (detections.starts | in_clutter)
         if first:
-            starts &= ~in_sidelobe(rows, bins, power, first)
+            starts &= ~in_sidelobe(rows, bins, power, first, known)
         detections = replace(detections, starts=starts)
         starts = starts & ~over_walls(detections, np.column_stack([rows, bins]), known)
         kept = np.flatnonzero((number == 0) | ~repeated(detections, known))
         detections = replace(detections, starts=starts).select(kept)
         found = [found[i] for i in kept]
         out = Sensed(found, detections, power, tested.level, correction=correction)
-        if clutter is None or self.settings.self_calibration != "positions":
+        if clutter is None or self.settings.self_calibration != "positions" or len(known.leaks) > 1:
             return out
         expected = expected_power(clutter, known, len(power), self.taper)
         noise = noise_level(power, expected, known.channels)
@@ -155,11 +155,11 @@ class AngleDoppler:
     ) -> list[Wave]:
         """Return the waves of a cell in which something was found."""
         search, bins = channel_search(known.antennas, known.wavenumber), maps.shape[3]
-        (row, column), c = cell, search.channels
+        row, column = cell
         inverse = tested.whiteners.get(cell)
         if inverse is None:
-            inverse = np.eye(len(c), dtype=np.complex64)
-        x = maps[c.tx, c.rx, row, (column + bins // 2) % bins]
+            inverse = np.eye(len(search.channels), dtype=np.complex64)
+        x = maps[:, :, row, (column + bins // 2) % bins].ravel()
         ratio = float(tested.ratio[cell])
         return waves_of(x, inverse, tested.cosines[cell], search, ratio)
 
@@ -224,19 +224,21 @@ class AngleDoppler:
         note(plain)
         filled = np.fft.ifftshift(expected, axes=1).ravel() > LEAST_CLUTTER * noise
         cell = plain.cell[filled[plain.cell] & (plain.peak > PRUNED * limits[0])]
-        R = Bucketed.of(hints.clutter, known, search, noise, self.taper).covariances(
-            *np.divmod(cell, power.shape[1])
-        )
-        seen = np.ascontiguousarray(x[0, :, cell])[:, None] / np.float32(np.sqrt(noise))
-        found, _ = search_white(seen, R, cell, search)
-        note(found)
-        above = found.peak > limits[0]
-        inverse = dict(zip(cell[above].tolist(), inverses(R[above]), strict=True))
+        expected_waves = Bucketed.of(hints.clutter, known, search, noise, self.taper)
+        inverse: dict[int, np.ndarray] = {}
+        for some in np.array_split(cell, 1 + cell.size * len(search.channels) ** 2 // MOST_KEPT):
+            R = expected_waves.covariances(*np.divmod(some, power.shape[1]))
+            seen = np.ascontiguousarray(x[0, :, some])[:, None] / np.float32(np.sqrt(noise))
+            found, _ = search_white(seen, R, some, search, PRUNED * limits[0])
+            note(found)
+            above = found.peak > limits[0]
+            inverse |= zip(some[above].tolist(), inverses(R[above]), strict=True)
         rows, bins = power.shape
         shown = [
             np.fft.fftshift(a.reshape(rows, bins, *a.shape[1:]), axes=1)
             for a in (ratio, sure, cosines)
         ]
+        shown[0] *= in_their_span(shown[0], len(known.leaks))
         held_up = unexplained(power / (noise + expected), shown[0] > 1, self.settings)
         half = bins // 2
         whiteners = {(c // bins, (c % bins + half) % bins): one for c, one in inverse.items()}
@@ -245,7 +247,7 @@ class AngleDoppler:
 
     def _limits(self, search: Search, known: Known) -> tuple[float, float]:
         """Thresholds of a detection and of one that may start a track."""
-        size = scanned(search.channels, known.wavenumber, known.antennas.view_limit)
+        size = scanned(search)
         usual, sure = self.settings.false_alarm_rates
         return field_threshold(*size, 1, usual), field_threshold(*size, 1, sure)
 
@@ -255,27 +257,6 @@ class BeamSpectra(LocalSpectra):
 
     def __init__(self, spectra: np.ndarray, known: Known, row: int, weights: np.ndarray) -> None:
         super().__init__(spectra, known, row, beam=weights.conj(), in_phase=True)
-
-
-def on_antennas(values: np.ndarray, known: Known) -> np.ndarray:
-    """(L_tx, L_rx) of what all channels of an echo have (L,)."""
-    channels, antennas = all_channels(known.antennas), known.antennas
-    out = np.zeros((antennas.num_tx, antennas.num_rx), complex)
-    out[channels.tx, channels.rx] = values
-    return out
-
-
-def near_beam(
-    estimate: Estimate, known: Known, cosines: np.ndarray, inverse: np.ndarray
-) -> np.ndarray:
-    """(u_x, u_z) near the filter's beam of the largest likelihood with R^-1 (L, L)."""
-    search = channel_search(known.antennas, known.wavenumber)
-    y = estimate.channels[search.channels.tx, search.channels.rx][None, None]
-    statistic = statistic_of(y @ inverse.T, inverse[None])
-    best = climbed(statistic, cosines[None], search, FINE, 2)[1][0]
-    period = 2 * np.pi / (known.wavenumber * known.antennas.spacing)
-    best = best - period * np.round(best / period)
-    return best if (best**2).sum() <= 1 else np.full(2, np.nan)
 
 
 def correct(power: np.ndarray, known: Known, clutter: ExpectedClutter) -> Correction:
@@ -303,8 +284,10 @@ def repeated(d: Detections, known: Known) -> np.ndarray:
 
 
 def _off(d: Detections, known: Known) -> np.ndarray:
-    """(Q, Q, 4) by how many resolutions detections are off others."""
-    off = d.measured[:, None] - d.measured
+    """(Q, Q, 4) by how many resolutions detections are off others, by none on an axis that the
+    array does not observe."""
+    measured = replace(d, direction=in_plane(d.direction, known)).measured
+    off = measured[:, None] - measured
     return np.asarray(off / resolutions(known.waveform, known.antennas, known.passes))
 
 
@@ -314,11 +297,17 @@ def _same_direction(off: np.ndarray, snr: np.ndarray) -> np.ndarray:
     return np.asarray(near & (snr > snr[:, None]))
 
 
-def in_sidelobe(rows: np.ndarray, bins: np.ndarray, power: np.ndarray, first: int) -> np.ndarray:
+def in_sidelobe(
+    rows: np.ndarray, bins: np.ndarray, power: np.ndarray, first: int, known: Known
+) -> np.ndarray:
     """Mark the cells that hold no more than the sidelobes of the strongest path before the row
-    `first`: the transmitter's leakage."""
+    `first`, the transmitter's leakage, in all spans of velocities in which it shows; a map of all
+    range cells has the last row beside the first."""
     row, column = np.unravel_index(power[:first].argmax(), power[:first].shape)
-    lobes = leaked(rows - row, bins - column, power.shape[1], UNION_FLOOR)
+    apart, span = rows - row, power.shape[1] // len(known.leaks)
+    if len(power) == known.waveform.num_samples:
+        apart = np.minimum(apart % len(power), -apart % len(power))
+    lobes = leaked(apart, (bins - column) % span, span, UNION_FLOOR)
     return np.asarray(power[rows, bins] <= LOBE_MARGIN * power[row, column] * lobes)
 
 

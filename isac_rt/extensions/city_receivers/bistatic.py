@@ -31,6 +31,7 @@ from isac_rt.extensions.city_receivers.adaptive import (
 from isac_rt.extensions.city_receivers.angle_doppler import noise_level
 from isac_rt.extensions.city_receivers.covariance import Bucketed
 from isac_rt.extensions.city_receivers.power import TAPER, expected_power
+from isac_rt.frame.antennas import resolutions
 from isac_rt.receive.cfar import (
     LOBE_MARGIN,
     first_row,
@@ -38,16 +39,19 @@ from isac_rt.receive.cfar import (
     strongest_peaks,
 )
 from isac_rt.receive.directions import (
-    FINE,
     PRUNED,
     Search,
-    climbed,
     receiver_search,
     search_plain,
     search_white,
-    statistic_of,
 )
-from isac_rt.receive.estimate import Estimate, LocalSpectra, standard_deviations
+from isac_rt.receive.estimate import (
+    Estimate,
+    LocalSpectra,
+    in_plane,
+    near_beam,
+    standard_deviations,
+)
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import UNION_FLOOR
 from isac_rt.receive.pursuit import LEFT_OVER_DB, BySchedule, take_strong
@@ -57,9 +61,6 @@ from isac_rt.receive.types import NO_HINTS, Detections, ExpectedClutter, Hints
 BESIDE = (3, 1)
 """Rows and bins about a path that was taken out which may hold its remainder, `LEFT_OVER_DB` below
 it."""
-SAME_DIRECTION = 0.2
-"""Off a strong path by less than this in both direction cosines, about a resolution of the default
-array, what its lobes could hide is taken for what its removal left."""
 STD_CELLS = 0.1
 """Smallest deviation of range and velocity, in cells, of what shares its cell with others."""
 
@@ -87,7 +88,7 @@ class BeamSearch(BySchedule):
             beam = _Beam(left, known, row, cosines[row, column])
             e = self.estimator.at(beam, ratio, row, column)
             estimates.append(e)
-            weak.append(_near(e, known, cosines[row, column]))
+            weak.append(near_beam(e, known, cosines[row, column]))
         limit = self._limits(receiver_search(known.antennas, known.wavenumber), known)[0]
         detections = _described(
             estimates, np.array(weak).reshape(-1, 2), ratio[rows, bins] * limit, known
@@ -149,7 +150,7 @@ class BeamSearch(BySchedule):
 
     def _limits(self, search: Search, known: Known) -> tuple[float, float]:
         """Thresholds of a detection and of one that may start a track."""
-        size = scanned(search.channels, known.wavenumber, known.antennas.view_limit)
+        size = scanned(search)
         usual, sure = self.settings.false_alarm_rates
         looks = known.antennas.num_tx
         return field_threshold(*size, looks, usual), field_threshold(*size, looks, sure)
@@ -209,14 +210,6 @@ class _Beam(LocalSpectra):
         super().__init__(spectra, known, row, beam=beam)
 
 
-def _near(estimate: Estimate, known: Known, cosines: np.ndarray) -> np.ndarray:
-    """(u_x, u_z) of the most power near a direction; NaN beyond the horizon."""
-    search = receiver_search(known.antennas, known.wavenumber)
-    statistic = statistic_of(estimate.channels[None])
-    best = climbed(statistic, cosines[None], search, FINE, 2)[1][0]
-    return best if (best**2).sum() <= 1 else np.full(2, np.nan)
-
-
 def _described(
     found: list[Estimate], direction: np.ndarray, statistic: np.ndarray, known: Known
 ) -> Detections:
@@ -246,5 +239,6 @@ def _remainders(weak: Detections, strong: Detections, known: Known) -> np.ndarra
     bins = np.minimum(bins % w.num_chirps, -bins % w.num_chirps)
     lobes = hann_envelope(np.maximum(rows - 1, 0)) * (hann_envelope(bins) + UNION_FLOOR)
     hidden = weak.snr[:, None] - 1 < LOBE_MARGIN * strong.snr * lobes
-    same = np.abs(weak.direction[:, None] - strong.direction).max(axis=2) < SAME_DIRECTION
+    off = in_plane(weak.direction, known)[:, None] - in_plane(strong.direction, known)
+    same = (np.abs(off) < resolutions(w, known.antennas, 1)[2:]).all(axis=2)
     return (hidden & same).any(axis=1)

@@ -30,7 +30,7 @@ from isac_rt.frame.payload import by_antenna, demodulate_bits, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.vector import new_memory
 from isac_rt.receive.arms import element_delays
-from isac_rt.receive.directions import climbed, receiver_search
+from isac_rt.receive.directions import denominators, search_of, settled
 from isac_rt.receive.spectrum import transform
 from isac_rt.receive.symbols import Symbols, known_cycles, nearest_symbols
 from isac_rt.receive.types import Prediction
@@ -324,16 +324,15 @@ def _direction(batch: Sequence[Peaks], antennas: Antennas, waveform: Waveform) -
         first = one.values[:, :, 0].reshape(-1, antennas.num_rx) / np.sqrt(one.noise)
         R += first.T @ first.conj()
     wavenumber = 2 * np.pi * waveform.effective_carrier / SPEED_OF_LIGHT
-    search, axis = receiver_search(antennas, wavenumber), np.linspace(-1, 1, 49)
-    grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-    grid = grid[(grid**2).sum(axis=1) <= 1]
+    search = search_of(antennas, wavenumber, 1)
 
     def power(a: np.ndarray) -> np.ndarray:
         return np.asarray(((a.conj() @ R) * a).sum(axis=-1).real)
 
-    best = grid[power(search.steering(grid)).argmax()]
-    steps = (axis[1] - axis[0]) / 2 ** np.arange(1.0, 6.0)
-    return climbed(power, best[None], search, steps.tolist(), 2)[1][0]
+    level = denominators(R[None], search)[0] * search.inside
+    best = np.unravel_index(level.argmax(), level.shape)
+    start = np.array([[u[i] for u, i in zip(search.cosines, best, strict=True)]])
+    return settled(power, start, search)[0]
 
 
 def _comb(seen: Sequence[_Seen], waveform: Waveform) -> tuple[np.ndarray, np.ndarray] | None:

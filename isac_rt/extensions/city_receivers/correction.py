@@ -55,7 +55,7 @@ def fit(power: np.ndarray, noise: float, clutter: ExpectedClutter, known: Known)
     """
     w = known.waveform
     rows = min(power.shape[0], w.num_range_cells)
-    response = Response(w, rows, UNTAPERED)
+    response = Response(w, rows, UNTAPERED, known.leaks)
     towards = clutter.departure + clutter.arrival
     per_velocity = -w.carrier() * w.frame_duration / SPEED_OF_LIGHT * towards  # bins per m/s
     beat, doppler = cells_of(clutter, w)

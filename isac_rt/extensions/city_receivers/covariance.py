@@ -51,7 +51,7 @@ class Bucketed:
         cls, clutter: ExpectedClutter, known: Known, search: Search, noise: float, taper: Taper
     ) -> Bucketed:
         """The scatterers that some cell holds; `noise` of a cell of one channel."""
-        w = known.waveform
+        w, leaks = known.waveform, known.leaks
         beat, doppler = cells_of(clutter, w)
         tables = _tables(w, taper)
         strongest = tables[0].max() * tables[1].max()
@@ -64,18 +64,27 @@ class Bucketed:
             doppler[received],
             row[received],
         )
+        steer = turned(-known.wavenumber * (clutter.arrival @ search.channels.places.T))
+        power = (clutter.power / noise).astype(np.float32)
+        if len(leaks) > 1:  # the same scatterers once more for each image
+            sent = steer.reshape(-1, known.antennas.num_tx, known.antennas.num_rx)
+            steer = np.einsum("kba,sar->ksbr", leaks.astype(np.complex64), sent, optimize=True)
+            steer = steer.reshape(-1, len(search.channels))
+            at = w.num_chirps / len(leaks) * np.arange(len(leaks))
+            doppler = np.add.outer(at, doppler).ravel()
+            beat, row, power = (np.tile(of, len(leaks)) for of in (beat, row, power))
+        else:
+            power *= np.float32(abs(leaks[0, 0, 0]) ** 2)
         column = np.round(doppler).astype(np.int64)
         bucket = row * w.num_chirps + column % w.num_chirps
-        share = (clutter.power / noise).astype(np.float32)
         # by bucket, then by falling power, whose bits grow as it does
-        order = np.argsort((bucket << 32) - share.view(np.int32))
-        places = search.channels.places
+        order = np.argsort((bucket << 32) - power.view(np.int32))
         return cls(
             np.searchsorted(bucket[order], np.arange(rows * w.num_chirps + 1)),
             (beat - row + REACH)[order].astype(np.float32),
             (doppler - column)[order].astype(np.float32),
-            share[order],
-            turned(-known.wavenumber * (clutter.arrival[order] @ places.T)),
+            power[order],
+            steer[order],
             tables,
             search.spread(taper.cosine),
             w.num_chirps,

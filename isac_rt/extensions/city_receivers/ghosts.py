@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from isac_rt.extensions.city_receivers.walls import Walls, lengths
-from isac_rt.frame.antennas import Antennas, resolutions
+from isac_rt.frame.antennas import Antennas, folded, resolutions
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import Ambiguity, measure, wrapped
@@ -119,24 +119,19 @@ class Leeway:
     resolution : (4,) range [m], velocity [m/s], u_x, u_z, of `frame.antennas.resolutions`; of one
         pass at a passive terminal
     ambiguity : of range and velocity
-    turn : of `Antennas`: an image may stand beyond the view
+    turns : of `Antennas`: an image may stand beyond the view
     """
 
     resolution: np.ndarray
     ambiguity: Ambiguity
-    turn: float = np.inf
+    turns: np.ndarray | float = np.inf
 
     @classmethod
     def of(cls, waveform: Waveform, antennas: Antennas, passes: int) -> Leeway:
         """At an active terminal (2 passes) or a passive one (1)."""
         cells = resolutions(waveform, antennas, passes)
-        turn = antennas.turn(waveform.wavelength, passes)
-        return cls(cells, Ambiguity.of(waveform, passes), turn)
-
-    def folded(self, off: np.ndarray) -> np.ndarray:
-        """Return differences (..., 2) of cosines by the nearest readings of those that the array
-        does not tell apart."""
-        return off - self.turn * np.round(off / self.turn) if np.isfinite(self.turn) else off
+        turns = antennas.turns(waveform.wavelength, passes)
+        return cls(cells, Ambiguity.of(waveform, passes), turns)
 
     def explained(
         self, off: np.ndarray, std: np.ndarray, one_way: bool | np.ndarray = False
@@ -145,7 +140,7 @@ class Leeway:
         deviations and whether they are of an active terminal's echo over a wall on `one_way` (...).
         """
         off = wrapped(off, self.ambiguity)
-        off[..., 2:] = self.folded(off[..., 2:])
+        off[..., 2:] = folded(off[..., 2:], self.turns)
         share = np.where(np.asarray(one_way)[..., None], ONE_WAY_SHARE, RESOLUTION_SHARE)
         share = np.where([False, False, True, True], share, RESOLUTION_SHARE)
         allowed = DEVIATIONS * std + share * self.resolution

@@ -17,6 +17,7 @@ from isac_rt.extensions.city_receivers.blind import DataPath, Peaks, acquire, fi
 from isac_rt.extensions.city_receivers.ghosts import Leeway
 from isac_rt.extensions.city_receivers.images import WELL_INSIDE, sender_images
 from isac_rt.extensions.city_receivers.walls import Walls
+from isac_rt.frame.antennas import folded
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.passive import PassiveReceiver
@@ -228,7 +229,7 @@ class OutOfSequence(OtherPaths):
             GATE_CELLS * self._cells, GATE_STDS * np.sqrt(np.diag(path.covariance)[:2])
         )
         # zero on an axis that is not seen
-        aside = self._leeway.folded(np.nan_to_num(d.direction - path.direction))
+        aside = folded(np.nan_to_num(d.direction - path.direction), self._leeway.turns)
         near = (off < gate).all(axis=1) & (np.abs(aside) < self._beam).all(axis=1)
         if not near.any():
             return False

@@ -96,11 +96,13 @@ class Response:
     waveform : Waveform
     rows : at most N/2, which hold every chirp
     taper : Taper
+    leaks : of `Known`; what a channel shows of several antennas is added by power
     """
 
     waveform: Waveform
     rows: int
     taper: Taper
+    leaks: np.ndarray
 
     def of(
         self, beat: np.ndarray, doppler: np.ndarray, power: np.ndarray, slope: np.ndarray
@@ -123,7 +125,12 @@ class Response:
             folded = spectra[:, :half] + spectra[:, size : size + half]
             folded += spectra[:, size : size - half : -1].conj()
             made[:] = scipy.fft.irfft(folded, size)
-        return np.fft.fftshift(out, axes=2)
+        shares = (np.abs(self.leaks) ** 2).sum(axis=(1, 2)) / self.leaks.shape[1]
+        shown = np.fft.fftshift(out, axes=2)
+        if shares.size == 1:
+            return shares[0] * shown
+        steps = size // shares.size * np.arange(shares.size)
+        return sum(q * np.roll(shown, step, axis=2) for q, step in zip(shares, steps, strict=True))
 
     def _places(
         self, beat: np.ndarray, doppler: np.ndarray
@@ -145,6 +152,6 @@ def expected_power(
 ) -> np.ndarray:
     """(num_rows, P) mean clutter power of a channel, Doppler centred as in `accumulate`."""
     beat, doppler = cells_of(clutter, known.waveform)
-    response = Response(known.waveform, num_rows, taper)
+    response = Response(known.waveform, num_rows, taper, known.leaks)
     power = response.of(beat, doppler, clutter.power, np.zeros((len(clutter), 0)))[0]
     return np.maximum(power, 0).astype(np.float32)

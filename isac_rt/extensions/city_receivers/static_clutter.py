@@ -59,18 +59,19 @@ class StaticClutter(TrackRule):
 
     Parameters
     ----------
-    turn : of `Antennas`: an echo from beyond the view is seen so far beside its direction
+    turns : of `Antennas`: an echo from beyond the view is seen so far beside its direction
     walls : the mesh; None: nothing is known of it
     velocity_period : span of unambiguous velocities [m/s]
     """
 
-    def __init__(self, turn: float, walls: Walls | None, velocity_period: float) -> None:
+    def __init__(
+        self, turns: np.ndarray | float, walls: Walls | None, velocity_period: float
+    ) -> None:
         self._walls, self._period = walls, velocity_period
         self._crowd = np.zeros(0, bool)
         self.state = Seen()
-        steps = (0, -1, 1) if np.isfinite(turn) else (0,)
-        by = [step * turn if step else 0.0 for step in steps]
-        self._aliases = np.array([(x, z) for x in by for z in by])
+        by = [(0.0, -t, t) if np.isfinite(t) else (0.0,) for t in np.broadcast_to(turns, 2)]
+        self._aliases = np.array([(x, z) for x in by[0] for z in by[1]])
 
     @classmethod
     def of(
@@ -78,7 +79,7 @@ class StaticClutter(TrackRule):
     ) -> StaticClutter:
         """For the array of an active terminal (passes = 2) or a passive one."""
         period = Ambiguity.of(waveform, passes).period
-        return cls(antennas.turn(waveform.wavelength, passes), walls, period)
+        return cls(antennas.turns(waveform.wavelength, passes), walls, period)
 
     def births(self, detections: Detections, own: Own) -> Detections:
         self._crowd = np.zeros(len(detections), bool)

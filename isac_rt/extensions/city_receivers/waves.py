@@ -21,7 +21,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isac_rt.receive.directions import FINE, Search, climbed, denominators, on_grid, statistic_of
+from isac_rt.receive.directions import (
+    Search,
+    climbed,
+    denominators,
+    settled,
+    statistic_of,
+    strongest_on_grid,
+)
 from isac_rt.receive.estimate import Estimate
 
 MOST_WAVES = 3
@@ -93,7 +100,7 @@ def waves_of(
         u = np.concatenate([u, further])
         for k in ROUNDS * list(range(len(u))):
             Q = nulled(inverse, search.steering(np.delete(u, k, axis=0)).T)
-            u[[k]] = climbed(statistic_of((Q @ x)[None, None], Q[None]), u[[k]], search, FINE)[1]
+            u[[k]] = settled(statistic_of((Q @ x)[None, None], Q[None]), u[[k]], search)
     A, out = search.steering(u).T, []
     for k in range(len(u)):
         Q = nulled(inverse, np.delete(A, k, axis=1))
@@ -116,7 +123,8 @@ def _further(
     before, after = denominators(np.stack([inverse, Q]), search)
     y = (Q @ x)[None, None]
     scale = np.where(after > RESOLVED * before, 1 / after, 0.0)
-    peak, cosines = climbed(statistic_of(y, Q[None]), on_grid(y, scale[None], search)[1], search)
+    near = strongest_on_grid(y, scale[None], search)[1]
+    peak, cosines = climbed(statistic_of(y, Q[None]), near, search)
     return float(peak[0]), cosines
 
 

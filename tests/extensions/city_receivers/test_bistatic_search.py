@@ -31,8 +31,7 @@ def white(rng: np.random.Generator, *shape: int) -> np.ndarray:
 
 
 def limit(rate: float) -> float:
-    size = scanned(SEARCH.channels, SEARCH.wavenumber, ANTENNAS.view_limit)
-    return field_threshold(*size, LOOKS, rate)
+    return field_threshold(*scanned(SEARCH), LOOKS, rate)
 
 
 def test_false_alarms_of_the_search_are_those_designed():

@@ -13,9 +13,7 @@ from scipy import stats
 from isac_rt.extensions.city_receivers.adaptive import expected_count, scanned
 from isac_rt.extensions.city_receivers.angle_doppler import (
     AngleDoppler,
-    near_beam,
     noise_level,
-    on_antennas,
     over_walls,
 )
 from isac_rt.extensions.city_receivers.covariance import Bucketed
@@ -24,10 +22,10 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.active import receive_active
-from isac_rt.receive.arms import all_channels, arm
+from isac_rt.receive.arms import Channels, all_channels
 from isac_rt.receive.cfar import CfarRule
-from isac_rt.receive.directions import Search, channel_search, search_plain, search_white
-from isac_rt.receive.estimate import Estimate
+from isac_rt.receive.directions import channel_search, search_plain, search_white
+from isac_rt.receive.estimate import Estimate, near_beam
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.settings import Receivers
@@ -159,7 +157,7 @@ def test_search_finds_the_largest_statistic_over_directions(white: bool):
     antennas = replace(ANTENNAS, rx_x=6, rx_z=5)
     known_ = silent(w, antennas)
     channels = all_channels(antennas)
-    search = Search.of(channels, known_.wavenumber, antennas.view_limit)
+    search = channel_search(antennas, known_.wavenumber)
     size = len(channels)
     mixed = rng.standard_normal((size, size, 2)) @ np.array([1, 1j])
     R = np.eye(size) + (0 if white else 0.2) * mixed @ mixed.conj().T
@@ -227,7 +225,9 @@ def test_expected_count_is_that_of_a_fine_scan():
     """One arm scanned 16 times as finely: crossings of t = 7 against the Euler characteristic.
     Planted bug: sqrt(t/pi) without pi."""
     w, rng, draws = Waveform(), np.random.default_rng(4), 40000
-    channels = arm(ANTENNAS, 0)
+    row = np.arange(16)
+    place = ANTENNAS.spacing * row
+    channels = Channels(row, row, np.stack([place, 0 * place, 0 * place], axis=1))
     u = np.zeros((513, 3))
     u[:, 0] = np.linspace(-1, 1, 513) * np.sin(ANTENNAS.half_view)
     k = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT
@@ -289,8 +289,9 @@ def test_size_of_the_scanned_directions():
         channels.places[:, 0] - channels.places[:, 0].mean(),
         channels.places[:, 2] - channels.places[:, 2].mean(),
     )
-    k, side = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT, 2 * np.sin(antennas.half_view)
-    lengths, area = scanned(channels, k, antennas.view_limit)
+    k = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT
+    side = 2 * np.pi / (k * antennas.spacing)  # what the elements tell apart is all in view
+    lengths, area = scanned(channel_search(antennas, k))
     assert lengths == pytest.approx(
         (side * k * np.sqrt((x * x).mean()), side * k * np.sqrt((z * z).mean())), rel=1e-9, abs=0
     )
@@ -312,7 +313,7 @@ def test_direction_within_a_filters_beam():
     found = near_beam(estimate, silent(w, antennas), u + np.array([0.043, -0.038]), np.eye(size))
     assert np.abs(found - u).max() < 0.003
     steering = all_channels(antennas).steering(np.array([[u[0], 0.0, u[1]]]), silent(w, antennas))
-    weights = on_antennas(steering[0], silent(w, antennas))
+    weights = steering[0].reshape(antennas.num_tx, -1)
     assert np.count_nonzero(weights) == size
     assert abs((weights.conj() * np.outer(*wave)).sum()) == pytest.approx(
         size, rel=2e-3

@@ -237,10 +237,10 @@ def test_directions_turn_by_what_the_array_tells_apart_whatever_the_view(passes)
     antennas = Antennas(
         tx_x=2, tx_z=2, rx_x=4, rx_z=4, spacing=0.5 * w.wavelength, half_view=np.radians(40)
     )
-    turn = Leeway.of(w, antennas, passes).turn
+    turns = Leeway.of(w, antennas, passes).turns
     places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
     places = (places - places[0]) / w.wavelength
-    for axis in (0, 2):
+    for turn, axis in zip(turns, (0, 2), strict=True):
         assert np.exp(2j * np.pi * turn * places[:, axis]) == pytest.approx(1, abs=1e-9)
         assert np.abs(np.exp(1j * np.pi * turn * places[:, axis]) - 1).max() > 1
 
