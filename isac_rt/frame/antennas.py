@@ -191,7 +191,7 @@ class Antennas:
         return float(np.sin(min(self.half_view, np.pi / 2)))
 
     def in_view(self, direction: np.ndarray) -> np.ndarray:
-        """Mark the body-frame unit vectors (..., 3) in the field of view of both arms."""
+        """Mark the body-frame unit vectors (..., 3) in the field of view on both axes."""
         limit = self.view_limit
         return (
             (direction[..., 1] > 0)

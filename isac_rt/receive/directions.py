@@ -401,8 +401,9 @@ def direction_bound(antennas: Antennas, passes: int, wavenumber: float) -> np.nd
     axes = np.flatnonzero(antennas.observes(passes))
     out = np.diag([np.inf, np.inf])
     if axes.size:
-        fisher = 2 * wavenumber**2 * np.cov(places[:, 2 * axes].T, bias=True)
-        out[np.ix_(axes, axes)] = np.linalg.inv(np.atleast_2d(fisher))
+        fisher = np.atleast_2d(2 * wavenumber**2 * np.cov(places[:, 2 * axes].T, bias=True))
+        least = 1e-9 * np.trace(fisher) * np.eye(axes.size)  # of a row that stands askew
+        out[np.ix_(axes, axes)] = np.linalg.inv(fisher + least)
     return out
 
 

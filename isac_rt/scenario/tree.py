@@ -101,7 +101,7 @@ class Scenario(Node):
     receiver_preset: Preset | None = None
     """Settings of `receivers` and `tracking` by name, which stated keys override. `paper`: the
     paper's. `plain`: better estimates, no knowledge of the city. `city`: uses the mesh. null, the
-    default: `city` in a traced city with an L array, else `plain`."""
+    default: `city` in a traced city, else `plain`."""
     receivers: Receivers = Receivers()
     """How terminals detect targets and decode data. By default by CFAR and added powers."""
     tracking: Tracking = Tracking()

@@ -82,6 +82,16 @@ def test_bound_of_a_row_by_hand():
     assert np.isinf(bound[1, 1]) and bound[0, 1] == 0
 
 
+def test_a_row_askew_tells_one_angle():
+    """Its bound across is huge and no error; bug: the inverse of a singular matrix."""
+    askew = Antennas.placed([(0, 0)], [(i * LAMBDA / 2, i * LAMBDA / 2) for i in range(4)])
+    along = np.array([1.0, 1.0]) / np.sqrt(2)
+    k = known(askew, 2)
+    bound, by_hand = direction_bound(askew, 2, k.wavenumber), 12 / (k.wavenumber * LAMBDA) ** 2 / 15
+    assert along @ bound @ along == pytest.approx(by_hand, rel=1e-3)
+    assert bound[0, 0] > 1e6 * by_hand
+
+
 @pytest.mark.parametrize("passes", [1, 2])
 def test_an_l_in_places_finds_what_its_arms_find(passes):
     """Without noise both estimators give the wave that was put in, near and far."""

@@ -31,14 +31,14 @@ def sense(capture: Capture, settings: Receivers) -> Reception:
     Raises
     ------
     CaptureError  If the places of the elements are unknown, or the settings ask for what a measured
-        frame does not have: a mesh, or the arms of an L.
+        frame does not have.
     """
     cube = capture.cube
     for key, able in (("clutter_detector", ("cfar",)), ("refinement", ("local", "grid"))):
         if (value := getattr(settings, key)) not in able:
             raise CaptureError(
-                f"receivers.{key}: {value} needs a city's mesh or an array of two arms, which a "
-                f"measured frame does not have; use {' or '.join(able)}"
+                f"receivers.{key}: {value} is not made for a measured frame, which comes without a "
+                f"city's mesh; use {' or '.join(able)}"
             )
     found = receive_active(
         cube, unmodulated(cube.waveform), _antennas(capture), settings, maps=True
