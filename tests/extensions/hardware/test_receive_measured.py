@@ -95,7 +95,7 @@ def test_places_are_needed_for_directions(tmp_path):
 def test_what_a_measured_frame_does_not_have_is_refused(tmp_path, asked):
     """Both ended in tracebacks."""
     ((key, value),) = asked.items()
-    with pytest.raises(CaptureError, match=f"receivers.{key}: {value} needs a city's mesh"):
+    with pytest.raises(CaptureError, match=f"receivers.{key}: {value} is not made for a measured"):
         sense(moving(tmp_path), Receivers(**asked))
 
 
