@@ -7,6 +7,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import orth
 from scipy.special import chndtr
 
 from isac_rt.frame.antennas import Antennas
@@ -158,7 +159,8 @@ class Chance:
     cell : SNR in its cell of one channel's map
     channels : SNR in its cell, all channels in phase
     straddling : share of its power that is left where it lies between cells
-    whitened : SNR in its cell, channels whitened by the city's paths in it
+    whitened : SNR in its cell, channels whitened by the city's paths in it, and the line of sight
+        taken out
     clutter : power of the diffuse paths in that cell
     background : what other paths add to the mean of the cells around it
     masked : a stronger path covers it
@@ -202,7 +204,9 @@ class Chance:
             cell,
             every,
             off_grid,
-            every * _whitened_share(own, centre, paths, places, sees, channels),
+            every
+            * _whitened_share(own, centre, paths, places, sees, channels)
+            * _beside_sight(own, paths, w, channels),
             sees.cell * clutter,
             background,
             masked,
@@ -242,6 +246,42 @@ def _whitened_share(
     clutter = channels.steering(paths, some) * np.sqrt(power)[:, None]
     covariance = np.eye(len(mine)) + clutter.T @ clutter.conj()
     return float((mine.conj() @ np.linalg.solve(covariance, mine)).real / len(mine))
+
+
+def _beside_sight(own: int, paths: PathSet, waveform: Waveform, channels: Channels) -> float:
+    """Return the share of a path's energy that is left once the strongest line of sight is taken
+    out, as a receiver must that does not know its amplitude by transmit antenna, delay, delay rate
+    and direction of arrival: 1 less the projection on it and on its four derivatives.
+
+    A frame's samples fill delay, Doppler and receivers evenly, so that the inner products factor:
+    over an axis of unit length a tone x cells off has sinc(x) along the constant and
+    (sinc(x) - cos(pi x)) / (2 pi x) along the line j n, of norm 12^-1/2.
+    """
+    sights = np.flatnonzero(paths.kind == PathKind.LINE_OF_SIGHT)
+    if not sights.size:
+        return 1.0
+    w, sight = waveform, sights[np.argmax(paths.power[sights])]
+    both, middle = np.array([own, sight]), np.zeros(1)
+    beats = w.beat_cells(paths.delay[both, None], paths.delay_rate[both, None], middle)[:, 0]
+    rate = paths.delay_rate[own] - paths.delay_rate[sight]
+    x = np.array(
+        [
+            (beats[0] - beats[1]) * w.window_length / w.num_samples,
+            rate * w.effective_carrier * w.frame_duration,
+        ]
+    )
+    flat = np.sinc(x)
+    x = np.where(np.abs(x) < 1e-6, 1e-6, x)
+    line = np.sqrt(12) * (np.sinc(x) - np.cos(np.pi * x)) / (2 * np.pi * x)
+    u = channels.rx.to_body(paths.arrival[both])
+    places = channels.antennas.rx_positions
+    constant = np.full((len(places), 1), len(places) ** -0.5)
+    basis = np.hstack([constant, orth(places - places.mean(axis=0))])
+    steering = np.exp(1j * channels.wavenumber * places @ (u[0] - u[1])) * constant[:, 0]
+    of_receivers = np.abs(basis.T @ steering) ** 2
+    taken = of_receivers.sum() * flat.prod() ** 2
+    taken += of_receivers[0] * ((line[0] * flat[1]) ** 2 + (flat[0] * line[1]) ** 2)
+    return max(1.0 - float(taken), 0.0)
 
 
 def _around(

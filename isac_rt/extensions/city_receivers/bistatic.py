@@ -31,11 +31,8 @@ from isac_rt.extensions.city_receivers.adaptive import (
 from isac_rt.extensions.city_receivers.angle_doppler import noise_level
 from isac_rt.extensions.city_receivers.covariance import Bucketed
 from isac_rt.extensions.city_receivers.power import TAPER, expected_power
-from isac_rt.frame.antennas import resolutions
 from isac_rt.receive.cfar import (
-    LOBE_MARGIN,
     first_row,
-    hann_envelope,
     strongest_peaks,
 )
 from isac_rt.receive.directions import (
@@ -93,12 +90,9 @@ class BeamSearch(BySchedule):
         detections = _described(
             estimates, np.array(weak).reshape(-1, 2), ratio[rows, bins] * limit, known
         )
-        first = describe(strong, snr, known)
-        if clutter is not None:  # a city's walls are as strong, and no mesh explains all of them
-            first = replace(first, starts=np.zeros(len(strong), bool))
-        starts = (sure[rows, bins] > 1) & ~_remainders(detections, first, known)
-        detections = replace(detections, starts=starts)
-        return Sensed([*strong, *estimates], Detections.joined([first, detections]), power, level)
+        detections = replace(detections, starts=sure[rows, bins] > 1)
+        joined = Detections.joined([describe(strong, snr, known), detections])
+        return Sensed([*strong, *estimates], joined, power, level)
 
     def _noise(
         self, power: np.ndarray, known: Known, clutter: ExpectedClutter | None
@@ -228,17 +222,3 @@ def _described(
         is_reference=np.zeros(len(found), bool),
         starts=np.ones(len(found), bool),
     )
-
-
-def _remainders(weak: Detections, strong: Detections, known: Known) -> np.ndarray:
-    """(Q,) which weak detections come from the direction of a strong one whose lobes would have
-    hidden them."""
-    w = known.waveform
-    rows = np.abs(weak.range[:, None] - strong.range) / w.range_cell(1)
-    bins = np.abs(weak.velocity[:, None] - strong.velocity) / w.velocity_cell(1)
-    bins = np.minimum(bins % w.num_chirps, -bins % w.num_chirps)
-    lobes = hann_envelope(np.maximum(rows - 1, 0)) * (hann_envelope(bins) + UNION_FLOOR)
-    hidden = weak.snr[:, None] - 1 < LOBE_MARGIN * strong.snr * lobes
-    off = in_plane(weak.direction, known)[:, None] - in_plane(strong.direction, known)
-    same = (np.abs(off) < resolutions(w, known.antennas, 1)[2:]).all(axis=2)
-    return (hidden & same).any(axis=1)

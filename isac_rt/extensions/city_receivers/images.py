@@ -3,7 +3,8 @@
 A wall that is met at a right angle sends the terminal's chirps straight back, and so does a corner
 of two planes, wall and ground above all, whatever the angle. Such an echo stands still in the world
 but is a point as a UAV is, and the scatterers of the expected clutter do not hold it. The terminal
-knows its pose and the mesh, so that it knows the range of each and its rate. Occlusion by other
+knows its pose and the mesh, so that it knows the range of each and its rate. A passive terminal
+knows its transmitter's, and the images of that one's line of sight. Occlusion by other
 buildings is not asked for: an image that is not there only forbids births in a few cells.
 """
 
@@ -13,14 +14,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from isac_rt.extensions.city_receivers.walls import Walls, lengths
-from isac_rt.frame.antennas import Antennas
+from isac_rt.extensions.city_receivers.walls import Walls
+from isac_rt.frame.antennas import Antennas, resolutions
 from isac_rt.frame.waveform import Waveform
 from isac_rt.kernels import track_images
 from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.track_images import EDGE, LEAST_RANGE
 from isac_rt.receive.types import Detections
-from isac_rt.track.filter import Ambiguity, wrapped
+from isac_rt.track.filter import Ambiguity, measure, wrapped
 from isac_rt.track.parts import Own, TrackRule
 from isac_rt.world.mirrors import mirror_image
 from isac_rt.world.swarm import Pose
@@ -34,32 +35,49 @@ ALIAS_DEVIATIONS = 3.0
 
 
 class Images(TrackRule):
-    """No track starts from what may be an active terminal's own image, or an alias from beyond the
+    """No track starts from what may be an image of the transmitter, or an alias from beyond the
     view.
 
     Parameters
     ----------
     walls : the mesh
-    passes : 2 at an active terminal, 1 at a passive one
+    passes : 2 at an active terminal, which sees itself, 1 at a passive one
     """
 
     def __init__(self, walls: Walls, antennas: Antennas, waveform: Waveform, passes: int) -> None:
         self._walls, self._passes = walls, passes
         self._edge = WELL_INSIDE * antennas.view_limit
         self._ambiguity = Ambiguity.of(waveform, passes)
-        self._cells = np.array([waveform.range_cell(passes), waveform.velocity_cell(passes)])
+        cells = np.array([waveform.range_cell(passes), waveform.velocity_cell(passes)])
+        self._beside = BESIDE_CELLS * cells
+        self._beam = resolutions(waveform, antennas, 1)[2:]
 
     def births(self, detections: Detections, own: Own) -> Detections:
         d = detections
         spread = ALIAS_DEVIATIONS * d.std[:, 2:] if self._passes == 1 else 0.0
         inside = np.abs(d.direction) + spread < self._edge
         starts = d.starts & inside.all(axis=1)
-        if starts.any() and self._passes == 2:
-            shown = own_images(own.pose, self._walls, float(d.range[starts].max()) + 1)
-            off = wrapped(d.measured[:, None, :2] - shown, self._ambiguity)
-            beside = (np.abs(off) < BESIDE_CELLS * self._cells).all(axis=-1)
-            starts &= ~beside.any(axis=1)
+        if starts.any():
+            some = np.flatnonzero(starts)
+            starts[some] = ~self._beside_images(d.select(some), own)
         return replace(d, starts=starts)
+
+    def _beside_images(self, d: Detections, own: Own) -> np.ndarray:
+        """(Q,) which detections may be images: at a passive terminal those that come from one
+        too."""
+        reach = float(d.range.max()) + 1
+        if self._passes == 2:
+            shown = own_images(own.pose, self._walls, reach)
+        elif own.transmitter is not None:
+            shown = sender_images(own.transmitter.mean[:6], own.pose, self._walls, reach)
+        else:
+            return np.zeros(len(d), bool)
+        off = np.abs(wrapped(d.measured[:, None, :2] - shown[:, :2], self._ambiguity))
+        beside = (off < self._beside).all(axis=-1)
+        if self._passes == 1:
+            away = np.abs(d.direction[:, None] - shown[:, 2:])
+            beside &= (away < self._beam + ALIAS_DEVIATIONS * d.std[:, None, 2:]).all(axis=-1)
+        return np.asarray(beside.any(axis=1))
 
 
 def own_images(own: Pose, walls: Walls, reach: float) -> np.ndarray:
@@ -72,12 +90,12 @@ def own_images(own: Pose, walls: Walls, reach: float) -> np.ndarray:
     """
     near = walls.near(own, reach)
     here = np.concatenate([own.position, own.velocity])
-    return _images(here, here, walls, (near, near), 2 * reach) / 2
+    return measure(_images(here, here, walls, (near, near), 2 * reach), own)[:, :2] / 2
 
 
 def sender_images(sender: np.ndarray, own: Pose, walls: Walls, reach: float) -> np.ndarray:
-    """Length [m] and its rate [m/s] of the ways from a transmitter to a passive terminal over one
-    or two planes: (K, 2).
+    """Length [m], its rate [m/s] and direction cosines of the ways from a transmitter to a passive
+    terminal over one or two planes: (K, 4).
 
     Parameters
     ----------
@@ -87,7 +105,7 @@ def sender_images(sender: np.ndarray, own: Pose, walls: Walls, reach: float) -> 
     """
     here = np.concatenate([own.position, own.velocity])
     near = walls.about(sender[:3], reach), walls.near(own, reach)
-    return _images(sender, here, walls, near, reach)
+    return measure(_images(sender, here, walls, near, reach), own)
 
 
 def _images(
@@ -97,7 +115,8 @@ def _images(
     near: tuple[np.ndarray, np.ndarray],
     reach: float,
 ) -> np.ndarray:
-    """Ways from `start` to `end` (6,), over mirrors that are near the one and the other."""
+    """Images (K, 6) of `start` (6,) that `end` (6,) sees, over mirrors that are near the one and
+    the other."""
     return np.concatenate(
         [_by_one(start, end, walls, near[1], reach), _by_two(start, end, walls, near, reach)]
     )
@@ -107,8 +126,7 @@ def _by_one(
     start: np.ndarray, end: np.ndarray, walls: Walls, near: np.ndarray, reach: float
 ) -> np.ndarray:
     _, images = walls.images(start, end, reach, EDGE, near)
-    found = lengths(images, end)
-    return found[found[:, 0] > 2 * LEAST_RANGE]
+    return images[np.linalg.norm(images[:, :3] - end[:3], axis=1) > 2 * LEAST_RANGE]
 
 
 def _by_two(
@@ -127,7 +145,7 @@ def _by_two(
     kept = walls.holds(i, A, EDGE) & walls.holds(j, B, EDGE)
     n, m, at_j = normals[i[kept]], normals[j[kept]], at_j[kept]
     turned = mirror_image(mirror_image(start[3:], n), m)
-    return lengths(np.hstack([at_j, turned]), end)
+    return np.hstack([at_j, turned])
 
 
 @twin_of(track_images.met)

@@ -120,7 +120,7 @@ class OutOfSequence(OtherPaths):
         length = path.mean[:2] - SPEED_OF_LIGHT * own.clock
         straight = measure(there, own.pose)[None, :2]
         over_walls = sender_images(there[:6], own.pose, self._walls, float(length[0]) + 1)
-        apart = np.abs(np.concatenate([straight, over_walls]) - length)
+        apart = np.abs(np.concatenate([straight, over_walls[:, :2]]) - length)
         return bool((apart < NAMED_CELLS * self._cells).all(axis=1).any())
 
     def _is_well_inside(self, reception: Reception) -> bool:

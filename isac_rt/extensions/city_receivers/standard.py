@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -19,7 +19,7 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import Detections, ExpectedClutter
+from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation.setup import Setup
@@ -27,42 +27,11 @@ from isac_rt.track.parts import (
     Equipment,
     HardwareModel,
     OtherPaths,
-    Own,
     TrackRule,
-    is_placed,
 )
 from isac_rt.track.settings import Tracking
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
-from isac_rt.track.tracker import Tracker
 from isac_rt.world.swarm import Pose
-
-REPORT_FRAMES = 5
-"""A passive terminal to which others report confirms none of its own tracks before so many frames
-after the first detection. It cannot see what flies near its line of sight, but receives its echoes
-over walls. The active terminal sees such a target a frame later at worst, confirms it in the third
-frame, and its report takes two more."""
-
-
-class PlacedTransmitter(TrackRule):
-    """No track starts while the transmitter's motion is not known to a Doppler `cell` [m/s]: the
-    expected clutter explains nothing before."""
-
-    def __init__(self, cell: float) -> None:
-        self._cell = cell
-
-    def births(self, detections: Detections, own: Own) -> Detections:
-        if own.transmitter is None or is_placed(own.transmitter, self._cell):
-            return detections
-        return replace(detections, starts=np.zeros(len(detections), bool))
-
-
-class AwaitedReports(TrackRule):
-    """No track is confirmed before others could have reported the target (`REPORT_FRAMES`)."""
-
-    def prune(self, tracker: Tracker, own: Own) -> None:
-        if own.cooperates:
-            for track in tracker.tracks:
-                track.confirmed &= track.age >= REPORT_FRAMES
 
 
 @dataclass(frozen=True)
@@ -151,9 +120,7 @@ def _passive_equipment(
     walls, clutter = surroundings.walls, surroundings.clutter
     rules: list[TrackRule] = []
     if tracking.births == "unexplained" and walls is not None:
-        if clutter is not None:
-            rules.append(PlacedTransmitter(waveform.velocity_cell(1)))
-        rules += [AwaitedReports(), *_rules_of_walls(walls, antennas, waveform, 1)]
+        rules += _rules_of_walls(walls, antennas, waveform, 1)
     other_paths = OtherPaths()
     if receivers.link_acquisition == "blind":
         receiver = PassiveReceiver.of(antennas, receivers, dpsk_order, groups)

@@ -18,7 +18,7 @@ from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
-from isac_rt.track.filter import Ambiguity
+from isac_rt.track.filter import BIRTH_SPEED_STD, Ambiguity
 from isac_rt.track.parts import Own, TrackRule
 from isac_rt.track.tracker import Track, Tracker, assign
 from isac_rt.world.swarm import Pose
@@ -120,13 +120,16 @@ class StaticClutter(TrackRule):
         real = far < 1 + 3 * d.std[:, None, 2:].max(axis=-1, initial=0.0)
         u = u / np.maximum(far, 1.0)[..., None]  # square to the boresight, but for the error
         towards = own.to_world(unit_vector(u))
-        place, rate, speed = _still(d.range, towards, own, sender)
+        place, rate, speed, seen = _still(d.range, towards, own, sender)
         off = d.velocity[:, None] - rate
         off = np.where(real, np.abs(off - self._period * np.round(off / self._period)), np.inf)
         best = off.argmin(axis=1)  # the direction in which it would stand still
         each = np.arange(len(d))
         across = speed * np.linalg.norm(d.std[:, 2:], axis=1)
-        still = off[each, best] < STILL_MPS + 3 * np.hypot(d.std[:, 1], across)
+        allowed = STILL_MPS + 3 * np.hypot(d.std[:, 1], across)
+        # between both ends of a passive link a UAV that flies along it has the rate of a still one
+        tells = BIRTH_SPEED_STD * seen[each, best] > 3 * allowed
+        still = tells & (off[each, best] < allowed)
         place = place[each, best]
         self._note(place[some := still & d.starts & ~d.is_reference], d.snr[some], time)
         return still & self.crowded(place, d.snr)
@@ -184,16 +187,20 @@ def rests(track: Track) -> bool:
 
 def _still(
     range: np.ndarray, towards: np.ndarray, own: Pose, sender: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Where echoes (Q,) are if they come from directions (Q, A, 3), the rate (Q, A) at which they
-    recede if they stand still there, and how fast the ends fly."""
+) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+    """Return where echoes (Q,) are if they come from directions (Q, A, 3), the rate (Q, A) at which
+    they recede if they stand still there, how fast the ends fly, and the rate of what moves at
+    1 m/s along the way to both ends (Q, A)."""
     speed = float(np.linalg.norm(own.velocity))
     rate = -(towards @ own.velocity)
     if sender is None:
-        return own.position + range[:, None, None] * towards, rate, speed
+        place = own.position + range[:, None, None] * towards
+        return place, rate, speed, np.ones(rate.shape)
     span, r = sender[:3] - own.position, range[:, None]
     far = (r**2 - span @ span) / (2 * np.maximum(r - towards @ span, 1e-9))
     place = own.position + far[..., None] * towards
     away = place - sender[:3]
-    rate = rate - (away @ sender[3:]) / np.maximum(np.linalg.norm(away, axis=-1), 1e-9)
-    return place, rate, speed + float(np.linalg.norm(sender[3:]))
+    away /= np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-9)
+    rate = rate - away @ sender[3:]
+    seen = np.linalg.norm(towards + away, axis=-1)
+    return place, rate, speed + float(np.linalg.norm(sender[3:])), seen

@@ -123,21 +123,6 @@ def test_a_weak_path_is_found_beside_a_strong_one(place):
     assert (np.abs(off) < 4 * d.std[1]).all()
 
 
-def test_a_strong_path_starts_a_track_where_there_is_no_city():
-    """A body 10 dB below the line of sight, 33 dB over the noise of a cell, may
-    start a track where no mesh is known, and none where one is. Planted bug: never."""
-    w, schedule, _ = frame(waveform=W)
-    cell, bin_ = w.range_cell(1), w.velocity_cell(1)
-    strong = Path(20.31 * cell, 2.2 * bin_, 1.0, (0.1, -0.05), (0.2, 0.1))
-    body = Path(31.4 * cell, -5.3 * bin_, 0.3, (-0.4, 0.3), (-0.3, 0.2))
-    samples = cube(w, schedule, unmodulated(w), [strong, body], noise=0.1, seed=4)
-    receiver = PassiveReceiver.of(ANTENNAS, Receivers(passive_detector="beams"), 8)
-    empty = ExpectedClutter(*(np.zeros(s) for s in (0, 0, 0, (0, 3), (0, 3))))
-    for clutter, starts in ((None, True), (empty, False)):
-        d = receiver.receive(samples, None, False, Hints(clutter)).detections
-        assert len(d) == 2 and bool(d.starts[~d.is_reference][0]) is starts
-
-
 def test_the_beam_alone_says_where_a_weak_path_is():
     """Two equal paths half a cell and half a bin apart, from directions in which the array hears
     little of the other: towards each the beam finds its own place, all channels together find

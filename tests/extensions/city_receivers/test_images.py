@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,14 +14,14 @@ from isac_rt.extensions.city_receivers.images import (
     own_images,
     sender_images,
 )
-from isac_rt.extensions.city_receivers.walls import Walls
+from isac_rt.extensions.city_receivers.walls import Walls, lengths
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
-from isac_rt.track.filter import Ambiguity
+from isac_rt.track.filter import Ambiguity, Gaussian
 from isac_rt.track.parts import Own
 from isac_rt.track.settings import Tracking
-from isac_rt.track.tracker import Tracker
+from isac_rt.track.tracker import Track, Tracker
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, attitude
 
@@ -80,7 +82,8 @@ def test_walls_show_a_passive_terminal_its_transmitter():
     for place, motion in images:
         span = np.array([3.7, 8.9, 2.2]) - place
         far = np.linalg.norm(span)
-        expected.append([far, span @ (VELOCITY - motion) / far])
+        seen = own.to_body(-span / far)
+        expected.append([far, span @ (VELOCITY - motion) / far, seen[0], seen[2]])
     found = unique(sender_images(sender, own, city(WALL, GROUND), 100.0))
     np.testing.assert_allclose(found, unique(np.array(expected)), rtol=0, atol=1e-8)
     for beyond in (-1e-6, 1e-6):
@@ -158,7 +161,7 @@ def test_all_ways_over_one_and_two_planes_are_found():
             expected.append([far[0], (far[2] - far[1]) / 2e-4])
     found = np.concatenate(
         [
-            one(sender, here, walls, near_ends, 500.0)
+            lengths(one(sender, here, walls, near_ends, 500.0), here)
             for one, near_ends in ((_by_one, near), (_by_two, (near, near)))
         ]
     )
@@ -210,6 +213,23 @@ def test_images_and_aliases_start_no_track():
         Own(OWN, 0.0),
     )
     assert found.starts.tolist() == [False, False, True, True, False]
+
+
+def test_images_of_the_transmitter_start_no_track_where_they_stand():
+    """Off the transmitter's image in a wall by nothing; by two cells of length; by two of rate; and
+    from elsewhere. Planted bugs: the direction left out; the receiver's own image instead."""
+    sender = np.append(OWN.position, [1.3, -0.4, 2.2])
+    own = pose([3.7, 8.9, 2.2], [1.0, 0.0, 0.0])
+    z = sender_images(sender, own, city(WALL), 100.0)[0]
+    known = Track.of_body(Gaussian(sender, 1e-4 * np.eye(6)))
+    d = detections(
+        [z[0], z[0] + 2 * W.range_cell(1), z[0], z[0]],
+        [z[1], z[1], z[1] + 2 * W.velocity_cell(1), z[1]],
+        [z[2], z[2], z[2], z[2] - 0.5],
+    )
+    d = replace(d, direction=np.column_stack([d.direction[:, 0], np.full(4, z[3])]))
+    found = Images(city(WALL), ANTENNAS, W, 1).births(d, Own(own, 0.0, reference=known))
+    assert found.starts.tolist() == [False, True, True, True]
 
 
 @pytest.mark.parametrize(("seen", "gone"), [(4, 6), (2, 3)])
