@@ -55,7 +55,6 @@ class Own:
     pose, time : its own pose, and the middle of the frame [s]
     reported_poses : poses that other terminals report, for the calibration of the own hardware
     reports : targets and terminals that others report
-    cooperates : whether others report anything at all
     sender : a passive terminal's transmitter as its data report it; None where they say nothing
         that counts
     over_other_path : whether data are read over another path than the line of sight
@@ -71,7 +70,6 @@ class Own:
     time: float
     reported_poses: Sequence[Pose] = ()
     reports: Sequence[ReportedUav] = ()
-    cooperates: bool = False
     sender: Track | None = None
     over_other_path: bool = False
     clock: np.ndarray = field(default_factory=lambda: np.zeros(2))

@@ -250,7 +250,7 @@ class PassiveTerminal(Stateful):
         cube = self.equipment.hardware.correct(cube, time)
         self.reference.predict(time)
         self.tracker.predict(time)
-        own = self._own(Own(own_pose, time, reported_poses, reports, sender is not None), sender)
+        own = self._own(Own(own_pose, time, reported_poses, reports), sender)
         self._hints = Hints(own.clutter)
         self._hand_over(own)
         reception = self._read(cube, own, modulated, maps)

@@ -31,7 +31,8 @@ from isac_rt.world.swarm import Pose
 
 SURE_HITS = 2
 """With `tracking.births: unexplained` a track is confirmed if so many of its detections could have
-started it: others pass a lower threshold, which strong clutter passes again and again."""
+started it: others pass a lower threshold, which strong clutter passes again and again. At an active
+terminal these are enough, for chance shows none of them twice."""
 ROUNDING = 1e-9
 """Of sums of frame intervals [s]."""
 
@@ -81,6 +82,8 @@ class Track:
     detection : row among the frame's detections that updated it, -1: none
     last : time of the last detection [s]
     sure : detections that could have started it
+    first_id : number of the first track that its first detection started, in another reading of its
+        velocity
     """
 
     id: int
@@ -93,6 +96,7 @@ class Track:
     detection: int = -1
     last: float = -np.inf
     sure: int = 1
+    first_id: int = -1
 
     @classmethod
     def of_body(cls, body: Gaussian, acceleration_std: float = 0.0, time: float = -np.inf) -> Track:
@@ -253,10 +257,11 @@ class Tracker(Stateful):
         for k, track in enumerate(self.tracks):
             q = hit.get(k)
             track.sure += q is not None and bool(detections.starts[q])
-            self._live(track, q is not None)
+            self._live(track, q is not None, transmitter is None)
             if q is not None:
                 track.snr, track.detection = float(detections.snr[q]), q
                 track.last = self.state.time
+        self._one_reading_each()
         self._condition(hit, z, detections.std, own, transmitter)
         self.state.tracks = [t for t in self.tracks if not self._dead(t)]
         free = [q for q in free if detections.starts[q]]
@@ -268,9 +273,11 @@ class Tracker(Stateful):
             acceleration_std=self.settings.acceleration_std_mps2,
             ambiguity=self.ambiguity,
         )
+        first: dict[int, int] = {}
         for i, mean, covariance in zip(which.tolist(), *states, strict=True):
             q, state = free[i], Gaussian(mean, covariance)
             track = Track(self.new_id(), state, float(detections.snr[q]), detection=q)
+            track.first_id = first.setdefault(q, track.id)
             track.last = self.state.time
             track.confirmed = self.settings.confirm_hits == 1
             self.tracks.append(track)
@@ -329,14 +336,28 @@ class Tracker(Stateful):
         z_mean, S = expected(mean, covariance, own, transmitter)
         return costs(z, std, z_mean, S, self.ambiguity, self.settings.gate_probability)
 
-    def _live(self, track: Track, hit: bool) -> None:
+    def _one_reading_each(self) -> None:
+        """Take back the confirmation of tracks in this frame while another reading of their first
+        detection has as many hits."""
+        for track in self.tracks:
+            if track.age < self.settings.confirm_window and track.first_id >= 0:
+                hits = sum(track.recent)
+                track.confirmed &= not any(
+                    other.first_id == track.first_id and sum(other.recent) >= hits
+                    for other in self.tracks
+                    if other is not track
+                )
+
+    def _live(self, track: Track, hit: bool, active: bool) -> None:
         s = self.settings
         track.age += 1
         track.missed = 0 if hit else track.missed + 1
         track.recent = [*track.recent, hit][-s.confirm_window :]
         enough = sum(track.recent) >= s.confirm_hits
-        sure = s.births == "all" or track.sure >= min(SURE_HITS, s.confirm_hits)
-        track.confirmed = track.confirmed or (enough and sure)
+        if s.births == "unexplained":
+            sure = track.sure >= min(SURE_HITS, s.confirm_hits)
+            enough = sure and (enough or active)
+        track.confirmed = track.confirmed or enough
 
     def _dead(self, track: Track) -> bool:
         """A confirmed track dies of `drop_misses` misses in a row, or of `drop_after_s` without a

@@ -476,11 +476,11 @@ def test_a_track_says_which_detection_updated_it():
 
 
 @pytest.mark.parametrize(
-    ("sure", "frame"), [((1, 1, 0, 0), 2), ((1, 0, 0, 1), 3), ((1, 0, 0, 0), None)]
+    ("sure", "frame"), [((1, 1, 0, 0), 1), ((1, 0, 0, 1), 3), ((1, 0, 0, 0), None)]
 )
 def test_one_sure_detection_confirms_no_track(sure, frame):
-    """Four detections in a row, some of which could have started the track: it is confirmed by
-    three, two of them sure. Planted bugs: any three; the first not counted."""
+    """Four detections in a row, some of which could have started the track: an active terminal
+    confirms it by two that are sure. Planted bugs: any two; the first not counted."""
     settings = Tracking(births="unexplained")
     tracker, first = Tracker(settings, Ambiguity(np.inf, 0.0)), None
     z = measure(BODY, OWN)

@@ -18,7 +18,7 @@ from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
-from isac_rt.track.filter import BIRTH_SPEED_STD, Ambiguity
+from isac_rt.track.filter import BIRTH_SPEED_STD, Ambiguity, mahalanobis
 from isac_rt.track.parts import Own, TrackRule
 from isac_rt.track.tracker import Track, Tracker, assign
 from isac_rt.world.swarm import Pose
@@ -31,9 +31,9 @@ MEMORY_S = 1.0
 BESIDE_M = (1.5, 16.0)
 """Spots that far apart are beside each other [m]: not one and the same, and not another
 building's."""
-STANDS = 11.3
-"""Squared distance of a velocity from nothing within which a track may stand still: 0.99 of chi
-squared of three."""
+STANDS_ODDS = 10.0
+"""Odds from which on a track stands still: the likelihood of its velocity if it does, over that if
+it flies as UAVs do. What is not known of its velocity says nothing."""
 CROWD = 3
 """So many spots beside it that were not found again make an echo part of a surface."""
 FOUND_AGAIN = 0.5
@@ -169,20 +169,25 @@ class StaticClutter(TrackRule):
         return out
 
     def holds(self, track: Track) -> bool:
-        """Return whether a track is static, as far as is known of it, within a crowd, or flies
-        where no UAV can, in a face."""
+        """Return whether a track is static within a crowd, or flies where no UAV can, in a face. A
+        confirmed one that was found in each of the latest frames is no passing spot."""
         place = track.state.mean[:3]
         if rests(track):
-            return bool(self.crowded(place[None], np.array([track.snr]))[0])
+            again = track.confirmed and track.age >= len(track.recent) and all(track.recent)
+            return not again and bool(self.crowded(place[None], np.array([track.snr]))[0])
         spread = float(np.sqrt(np.linalg.eigvalsh(track.state.covariance[:3, :3])[-1]))
         return self._walls is not None and self._walls.within(place, CLEAR_M - 2 * spread)
 
 
 def rests(track: Track) -> bool:
-    """Return whether a track is static, as far as is known of it."""
+    """Return whether a track is static, by the odds of its velocity."""
     velocity, P = track.state.mean[3:6], track.state.covariance[3:6, 3:6]
-    d2 = velocity @ np.linalg.solve(P + STILL_MPS**2 * np.eye(3), velocity)
-    return bool(d2 < STANDS)
+    d2, log_det = mahalanobis(
+        np.tile(velocity, (2, 1)),
+        P + np.square([STILL_MPS, BIRTH_SPEED_STD])[:, None, None] * np.eye(3),
+    )
+    still, flies = -(d2 + log_det) / 2
+    return bool(still - flies > np.log(STANDS_ODDS))
 
 
 def _still(

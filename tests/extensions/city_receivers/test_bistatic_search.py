@@ -16,10 +16,9 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.directions import receiver_search, search_plain, search_white
 from isac_rt.receive.estimate import LocalSpectra, refine
 from isac_rt.receive.known import Known
-from isac_rt.receive.passive import PassiveReceiver, receive_passive
+from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.types import ExpectedClutter, Hints
 
 W = Waveform(num_samples=256, num_chirps=24)
 SEARCH = receiver_search(ANTENNAS, 2 * np.pi * float(W.carrier()) / 299792458.0)

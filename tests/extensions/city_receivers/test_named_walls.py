@@ -12,9 +12,7 @@ from isac_rt.extensions.city_receivers.standard import Surroundings, passive_ter
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import Detections
-from isac_rt.track.filter import Gaussian, measure
-from isac_rt.track.parts import Own, follow
+from isac_rt.track.filter import Gaussian
 from isac_rt.track.reference import Followed
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import Track
@@ -141,32 +139,3 @@ def test_the_city_is_expected_from_where_the_data_say(read):
         terminal.step(None, OWN, 0.0, True, sender=told)
     expected = tracked.mean - off * read
     np.testing.assert_allclose(asked[0], expected, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize(("word", "first"), [(False, 2), (True, 5)])
-def test_a_terminal_that_is_told_of_others_waits_for_their_word(word, first, monkeypatch):
-    """A UAV in the open, seen in every frame: alone the terminal confirms it in the third, in a
-    swarm when the active one, that saw it as early, can have told of it. Planted bugs: no wait; a
-    step that does not ask whether data say where the transmitter is."""
-    around = Surroundings(city([[x + 200.0, y, z] for x, y, z in WALL]))
-    tracking = Tracking(births="unexplained")
-    terminal = passive_terminal(W, ANTENNAS, Receivers(), tracking, 8, 1.0, surroundings=around)
-    sender = Track.of_body(Gaussian(np.concatenate([SENDER, VELOCITY]), np.eye(6) * 1e-6))
-    flies = np.concatenate([TARGET, VELOCITY + np.array([1.0, 0.0, 0.0])])
-    z = measure(flies, OWN, sender.state.mean)
-    found = Detections(
-        range=z[:1],
-        velocity=z[1:2],
-        direction=z[None, 2:],
-        snr=np.full(1, 50.0),
-        std=np.array([[0.03, 0.08, 0.005, 0.006]]),
-        is_reference=np.zeros(1, bool),
-        starts=np.ones(1, bool),
-    )
-    confirmed = []
-    own = Own(OWN, 0.0, cooperates=word, reference=sender)
-    for n in range(7):
-        terminal.tracker.predict(1e-6 * n)
-        follow(terminal.tracker, terminal.equipment.rules, found, own)
-        confirmed += [n] * terminal.tracker.tracks[0].confirmed
-    assert confirmed == [*range(first, 7)]

@@ -163,16 +163,21 @@ def test_only_what_could_start_a_track_makes_a_surface():
     ("place", "velocity", "std", "expected"),
     [
         ((0.0, 30.0, 6.0), (0.2, -0.1, 0.0), 0.3, True),
-        ((0.0, 30.0, 6.0), (4.0, 0.0, 0.0), 5.0, True),  # static, for all that is known
+        ((0.0, 30.0, 6.0), (0.2, -0.1, 0.0), 9.0, False),  # nothing is known of its motion
         ((0.0, 30.0, 6.0), (4.0, 0.0, 0.0), 0.3, False),
         ((0.0, 90.0, 6.0), (0.2, -0.1, 0.0), 0.3, False),
     ],
 )
 def test_a_track_that_is_static_within_a_surface(place, velocity, std, expected):
-    """Planted bugs: the speed alone; the place alone."""
+    """One that was found again and again is none. Planted bugs: the speed alone; the place alone;
+    a track counts as found again though it was missed."""
     static = after(3, StaticClutter(1.71, None, PERIOD))
     P = np.diag([0.01] * 3 + [std**2] * 3 + [9.0] * 3)
     track = Track(1, Gaussian(np.array([*place, *velocity, 0, 0, 0]), P), 40.0)
+    assert static.holds(track) is expected
+    track.confirmed, track.age, track.recent = True, 5, [True] * 5
+    assert not static.holds(track)
+    track.recent = [True] * 4 + [False]
     assert static.holds(track) is expected
 
 
