@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame, known
 
 from isac_rt.frame.cube import Transmission
+from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
@@ -225,6 +227,68 @@ def test_whitened_channels_of_a_cell(bins):
     assert found.whitened < found.channels / 2
     assert found.whitened == pytest.approx(expected, rel=0.01)
     assert found.straddling == pytest.approx(float(hann_response(bins - 11.0)), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("cells", "bins", "u"),
+    [
+        (0.6, 0.3, (0.05, -0.04)),
+        (0.2, 1.3, (0.1, 0.02)),
+        (0.1, -0.1, (0.2, 0.1)),
+        (3.3, 0.0, (0, 0)),
+    ],
+)
+def test_energy_of_an_echo_beside_the_line_of_sight(cells, bins, u):
+    """Samples of the echo, for each transmit antenna, less their projection on those of the line of
+    sight and on what these change by with length, rate and direction. 0.01: slow time of an antenna
+    is drawn at random within three slots. Planted bugs: the direction's derivatives left out; the
+    line's norm forgotten; departures for arrivals."""
+    w, schedule, _ = frame(waveform=W)
+    cell, bin_ = w.range_cell(1), w.velocity_cell(1)
+    first = Path(11.0 * cell, 3.0 * bin_, 1.0, (0.12, -0.07), (0.3, 0.1))
+    # the beat holds the Doppler too
+    length = first.length + cells * cell - bins * cell * w.sampled_duration / w.frame_duration
+    arrival = (first.arrival[0] + u[0], first.arrival[1] + u[1])
+    second = Path(length, first.rate + bins * bin_, 1.0, arrival, (-0.2, 0.3))
+
+    def made(path):
+        part = cube(w, schedule, unmodulated(w), [path]).samples[..., -round(w.window_length) :]
+        at = [part.astype(complex).swapaxes(1, 2)[schedule == n].ravel() for n in range(w.num_tx)]
+        return np.array(at)
+
+    step, start = 1e-3, made(first)
+    moved = [
+        replace(first, length=first.length + step * cell),
+        replace(first, rate=first.rate + step * bin_),
+        replace(first, arrival=(first.arrival[0] + step, first.arrival[1])),
+        replace(first, arrival=(first.arrival[0], first.arrival[1] + step)),
+    ]
+    tangents = np.array([start] + [(made(path) - start) / step for path in moved])
+    left = total = 0.0
+    for n, echo_of in enumerate(made(second)):
+        Q = np.linalg.qr(tangents[:, n].T)[0]
+        left += float((np.abs(echo_of - Q @ (Q.conj().T @ echo_of)) ** 2).sum())
+        total += float((np.abs(echo_of) ** 2).sum())
+    ends = [(p.length, p.rate, p.departure, p.arrival) for p in (second, first)]
+    lengths, rates, *sides = (np.array(each) for each in zip(*ends, strict=True))
+    out, back = (
+        np.column_stack([d[:, 0], np.sqrt(1 - (d**2).sum(axis=1)), d[:, 1]]) for d in sides
+    )
+    paths = make_paths(
+        gain=np.array([0.01, 1.0]),
+        delay=lengths / SPEED_OF_LIGHT,
+        delay_rate=rates / SPEED_OF_LIGHT,
+        departure=out,
+        arrival=back,
+        kind=np.array([PathKind.TARGET, PathKind.LINE_OF_SIGHT]),
+        target=np.array([0, -1]),
+        epoch=0.0,
+        tx="AT",
+        rx="PT",
+        target_names=("U",),
+    )
+    found = chance_of(paths)
+    assert found.whitened / found.channels == pytest.approx(left / total, abs=0.01)
 
 
 def test_background_is_the_greater_of_the_two_sides():
