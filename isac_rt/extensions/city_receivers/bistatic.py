@@ -45,7 +45,6 @@ from isac_rt.receive.directions import (
 from isac_rt.receive.estimate import (
     Estimate,
     LocalSpectra,
-    in_plane,
     near_beam,
     standard_deviations,
 )
