@@ -58,6 +58,9 @@ def run(
 ) -> None:
     """Simulate a scenario and write results, figures and a report. After a stop the same command
     resumes it."""
+    from isac_rt.kernels.jit import use_whole_registers
+
+    use_whole_registers()
     from isac_rt.scenario.file import load
 
     loaded = load(scenario, overrides or (), frames, seed)
@@ -93,7 +96,7 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
     from isac_rt.results.files import save
 
     with working("loading the program"):
-        from isac_rt.kernels.jit import compilations_logged, use_whole_registers
+        from isac_rt.kernels.jit import compilations_logged
         from isac_rt.results.provenance import run_content
         from isac_rt.simulation import simulate
         from isac_rt.simulation.resume import Resume
@@ -101,7 +104,6 @@ def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, res
         from isac_rt.world.area import city_digest
 
         city = city_digest(loaded.city, loaded.folder)
-    use_whole_registers()
     resume = Resume(folder, run_content(loaded, snapshots, city))
     if restart:
         resume.remove()

@@ -48,7 +48,8 @@ def use_whole_registers() -> None:
     """Let loops take whole AVX-512 registers, which LLVM halves for the first processors that had
     them: 6 % of a run's processor time, the same bits.
 
-    For a process of its own, before its first kernel: it is a setting of numba as a whole.
+    For a process of its own, before another module of `kernels` is imported: it is a setting of
+    numba as a whole, which the first decorated function fixes.
     """
     config: Any = numba.config
     if AVX512 and config.CPU_FEATURES is None:

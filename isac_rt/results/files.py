@@ -17,6 +17,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from pydantic import BaseModel
 
 from isac_rt.results.recorder import Results
@@ -66,18 +67,30 @@ class _Summary(BaseModel):
 def write_dataset(dataset: xr.Dataset, file: Path) -> None:
     """Write a NetCDF-4 file, compressed and with checksums, that appears whole or not at all.
 
-    It is made in memory: on a full disk the HDF5 library may end the process.
+    It is made in memory: on a full disk the HDF5 library may end the process. xarray would load
+    dask to write it.
     """
-    from xarray.backends import H5NetCDFStore
+    import h5netcdf
+    import h5py
 
-    encoding = {
-        name: {} if v.dtype.kind in "OUT" or not v.ndim or not v.size else COMPRESSION
-        for name, v in dataset.variables.items()
-    }
     made = io.BytesIO()
-    store = H5NetCDFStore.open(made, "w", driver_kwds={"libver": HDF5_FORMAT})
-    dataset.drop_encoding().dump_to_store(store, encoding=encoding)
-    store.close()
+    apart = {name: {*c.dims} for name, c in dataset.coords.items() if name not in dataset.dims}
+    with h5netcdf.File(made, "w", libver=HDF5_FORMAT) as whole:
+        whole.dimensions = dict(dataset.sizes)
+        whole.attrs.update(dataset.attrs)
+        for name, variable in dataset.variables.items():
+            values, said = np.asarray(variable.values), dict(variable.attrs)
+            words = values.dtype.kind in "OU"
+            packed = {} if words or not values.size or not values.ndim else COMPRESSION
+            if values.dtype == bool:
+                values, said["dtype"] = values.astype(np.int8), "bool"
+            located = [str(other) for other, dims in apart.items() if dims <= {*variable.dims}]
+            if located and name not in dataset.coords:
+                said["coordinates"] = " ".join(located)
+            fill = np.nan if values.dtype.kind == "f" else None
+            values = values.astype(h5py.string_dtype()) if words else values
+            of = {"dtype": values.dtype, "data": values, "fillvalue": fill, **packed}
+            whole.create_variable(str(name), variable.dims, **of).attrs.update(said)
     write_whole(file, made.getvalue())
 
 

@@ -233,3 +233,16 @@ def test_two_processes_compile_at_once(copy):
     both = [subprocess.Popen([sys.executable, "-c", code], **settings) for _ in range(2)]
     assert [p.communicate()[0].split()[0] for p in both] == ["21001"] * 2
     assert run(copy) == ["21001", "1"]
+
+
+def test_a_run_asks_for_whole_registers_before_its_first_kernel():
+    """The first decorated function fixes numba's target. Seen failing where `run` asked once the
+    program was loaded: kernels then used half registers."""
+    code = """if True:
+    import sys
+    from isac_rt.kernels import jit
+    jit.use_whole_registers = lambda: print([m for m in sys.modules if "isac_rt.kernels." in m])
+    from isac_rt.cli.cli import main
+    main(["run", "none.yaml"])"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "['isac_rt.kernels.jit']"

@@ -293,15 +293,17 @@ def test_names_of_a_dense_swarm_cover_each_other_nowhere():
             assert {text for text, _ in drawn_texts(figure)} >= set(names)
 
 
-def test_figures_and_report_load_no_dask(tmp_path):
+def test_files_figures_and_report_load_no_dask(tmp_path):
     """Arrays of arrays in blocks take longer to load than three figures to draw. Planted bugs: a
     variable made with a look at its type; names of places left to the dataset to index; an observer
-    taken by its own indexing."""
+    taken by its own indexing; a file written by xarray."""
     code = (
         "import sys\nfrom fake_run import fake_run\n"
+        "from isac_rt.results.files import save\n"
         "from isac_rt.views.figures import make_figures\n"
         "from isac_rt.views.report import write_report\n"
         "results, out = fake_run(), sys.argv[1]\n"
+        "save(results, out)\n"
         "write_report(results, out, make_figures(results, out))\n"
         "print([name for name in sys.modules if name in ('dask', 'dask.array')])"
     )
