@@ -738,7 +738,7 @@ OF_TESTS = (
     ),
     (
         "test_swarm_scores::test_tracked_is_within_three_resolutions_of_a_link_that_sees_it",
-        Bug("results/swarm.py", "replace(b, velocity=s[3:])", "replace(b, velocity=0 * s[3:])"),
+        Bug("results/swarm.py", "velocity=s[3:])", "velocity=0 * s[3:])"),
     ),
     (
         "test_scoring::test_gospa_is_of_confirmed_tracks_and_targets_in_view",

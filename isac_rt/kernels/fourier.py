@@ -205,7 +205,7 @@ def transform(table, first, size, radices, twiddles):
     Once a stage has left parts of at most `NEAR` rows, each part is finished before the next is
     begun: all its other stages find it in the first-level cache.
     """
-    length, t, done = size, 0, 0
+    length, t, done = size, np.int64(0), 0  # a bare 0 has `_stage` compiled for 0 too
     while done < radices.size and length > NEAR:
         radix = radices[done]
         for part in range(first, first + size * ROW, length * ROW):

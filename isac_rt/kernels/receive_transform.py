@@ -28,9 +28,10 @@ def transform(samples, factor, turn, powers, out, radices, twiddles, place, at, 
     table, factors, turns, added, tapered = work
     num_rx, num_chirps, size = samples.shape[0], samples.shape[1], place.size
     lines = samples.reshape(num_rx * num_chirps, 2 * size)
+    zero = np.int64(0)  # a bare 0 has what it is given to compiled for 0 too
     for first in range(0, num_chirps, LANES):
         count = min(LANES, num_chirps - first)
-        _fill(factor, 0, first, count, factors)
+        _fill(factor, zero, first, count, factors)
         for i in range(turns.size // ROW):
             for lane in range(count):
                 turns[i * ROW + lane], turns[i * ROW + LANES + lane] = (
@@ -41,7 +42,7 @@ def transform(samples, factor, turn, powers, out, radices, twiddles, place, at, 
         for r in range(num_rx):
             _fill(lines, r * num_chirps, first, count, table)
             _multiply(table, factors)
-            lanefft.transform(table, 0, size, radices, twiddles)
+            lanefft.transform(table, zero, size, radices, twiddles)
             if added.size:
                 _add_power(table, place, added)
             if tapered.size:

@@ -592,7 +592,7 @@ def _gather(workspace, order, below, i, stop, line, pending):
 def add_below_noise(grids, paths, segment, chirps, t, w, buffer, workspace):
     """Add all paths to the grids of a batch of chirps."""
     order, below = paths.order[segment], paths.below[segment]
-    begin = 0
+    begin = np.int64(0)  # a bare 0 has `_gather` compiled for 0 too
     for g in range(paths.groups.shape[0]):
         link, offset, first, end = paths.groups[g]
         _send(workspace, chirps, link, offset, t, w)

@@ -123,7 +123,9 @@ class CfarRule:
         out = np.empty(power.shape)
         half = self.guard[1] + self.training[1]
         sides = self.side_rows(len(power))
-        fill_background(power, keep, sides, self.guard[0], half, LEAST_KEPT, out)
+        fill_background(
+            np.ascontiguousarray(power), keep, sides, self.guard[0], half, LEAST_KEPT, out
+        )
         return out
 
     def side_rows(self, rows: int) -> np.ndarray:

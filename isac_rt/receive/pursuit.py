@@ -308,7 +308,7 @@ def _add(spectra: np.ndarray, path: _Path, known: Known, sign: float) -> None:
         spectra,
         path.rows,
         sign * e.channels,
-        np.ascontiguousarray(known.schedule),
+        np.array(known.schedule, order="C"),
         w.beat_cells(e.delay, e.delay_rate, known.times),
         np.exp(2j * np.pi * cycles),
         path.sent,

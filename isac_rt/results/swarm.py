@@ -170,18 +170,17 @@ class SwarmScorer(Stateful):
         """(B, U) largest distance on any axis in resolutions of the link to which the state (B, 6)
         is nearest, of those that have the UAV in view; infinite where none has, and beyond the
         cutoff."""
-        out = np.full((len(states), len(poses)), np.inf)
-        bodies = [Pose.at_rest(s[:3]) for s in states]
-        bodies = [replace(b, velocity=s[3:]) for b, s in zip(bodies, states, strict=True)]
+        places = np.array([pose.position for pose in poses.values()])
+        near = np.linalg.norm(states[:, None, :3] - places, axis=-1) < GOSPA_CUTOFF_M
+        rows, out = np.flatnonzero(near.any(axis=1)), np.full(near.shape, np.inf)
+        bodies = [replace(Pose.at_rest(s[:3]), velocity=s[3:]) for s in states[rows]]
         for link, seen in seen_by.items():
             own, at = poses[link.rx], None if link.own else poses[link.tx]
             points = np.array([truth_of(own, b, at)[:4] for b in bodies]).reshape(-1, 4)
             for u in np.flatnonzero(seen):
                 truth = truth_of(own, [*poses.values()][u], at)
-                out[:, u] = np.minimum(out[:, u], self._resolutions[link].off(truth, points))
-        places = np.array([pose.position for pose in poses.values()])
-        distance = np.linalg.norm(states[:, None, :3] - places, axis=-1)
-        return np.where(distance < GOSPA_CUTOFF_M, out, np.inf)
+                out[rows, u] = np.minimum(out[rows, u], self._resolutions[link].off(truth, points))
+        return np.where(near, out, np.inf)
 
 
 def _errors(body: Fused, truth: np.ndarray) -> tuple[float, float, float]:

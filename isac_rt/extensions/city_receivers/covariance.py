@@ -96,7 +96,7 @@ class Bucketed:
         size = self.steer.shape[1]
         out = np.empty((rows.size, size, size), np.complex64)
         scatterers = self.start, self.beat, self.doppler, self.power, self.steer
-        cells = rows + REACH, bins, self.num_bins
+        cells = rows + REACH, np.ascontiguousarray(bins), self.num_bins
         fill_covariances(cells, scatterers, self.tables, self.shape, out)
         return out
 

@@ -86,6 +86,8 @@ class UavDiscs:
     ) -> np.ndarray:
         """Multiply `out` by the factors of straight parts that begin `before` along paths of length
         `total`; the paths that a body is near, once for each."""
+        # one layout, for which `near` is compiled once
+        starts, ends, before = (np.array(a, order="C") for a in (starts, ends, before))
         path, body, off, along = near(
             starts, ends, before, total, self.places, self.radii, spared, wavelength, LIT_REACH
         )

@@ -125,7 +125,7 @@ class Weights(NamedTuple):
     @classmethod
     def by_antenna(cls, known: Known, factors: np.ndarray) -> Weights:
         """One sum for the chirps of each transmit antenna."""
-        place = np.ascontiguousarray(known.schedule, np.int64)
+        place = np.array(known.schedule, np.int64, order="C")  # one that may be written, as others
         return cls(factors.astype(complex), place, known.antennas.num_tx)
 
     @classmethod
