@@ -244,7 +244,7 @@ MAX_LINES = {
     "receive": 6040,
     "track": 1884,
     "scenario": 1710,
-    "results": 3620,
+    "results": 3630,
     "simulation": 3380,
     "sweep": 2350,
     "views": 3040,

@@ -59,10 +59,9 @@ def run(
     """Simulate a scenario and write results, figures and a report. After a stop the same command
     resumes it."""
     from isac_rt.kernels.jit import use_whole_registers
-
-    use_whole_registers()
     from isac_rt.scenario.file import load
 
+    use_whole_registers()
     loaded = load(scenario, overrides or (), frames, seed)
     folder = out if out is not None else Path("runs") / loaded.name
     from isac_rt.results.files import check_folder

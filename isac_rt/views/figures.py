@@ -32,7 +32,6 @@ from isac_rt.views.style import (
     STYLE,
     colour_of,
     labelled,
-    lay_out,
     link_name,
     moment,
     words,
@@ -93,8 +92,7 @@ def _name(ax: Axes, points: np.ndarray, names: Sequence[str]) -> None:
     """Write names next to points (N, 2), each where it covers no other name and no marker."""
     figure = ax.get_figure(root=True)
     assert figure is not None
-    lay_out(figure)  # which decides where the points lie
-    ax.apply_aspect()
+    figure.draw_without_rendering()  # the layout decides where the points lie
     markers = ax.transData.transform(points)
     letter, taken = matplotlib.rcParams["font.size"] * figure.dpi / 72, list[Bbox]()
     style = {"fc": "white", "ec": "none", "alpha": 0.7, "boxstyle": "round,pad=0.1"}
@@ -395,7 +393,9 @@ def _figure(drawing: Drawing, style: Style) -> Figure:
             ax.set_xlabel("")
         if column:
             ax.set_ylabel("")
-    lay_out(figure)
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.execute(figure)
     figure.set_layout_engine(None)  # with one, saving draws everything twice
     return figure
 

@@ -7,7 +7,6 @@ from typing import Any
 import matplotlib
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 KIND_COLOURS = {
     "line_of_sight": "#000000",
@@ -76,13 +75,6 @@ def moment(dataset: xr.Dataset, snapshot: int) -> tuple[int, int]:
     """Index of a snapshot's frame, and the frame's number."""
     frame = int(dataset.snapshot_frame.values[snapshot])
     return frame, int(dataset.frame.values[frame])
-
-
-def lay_out(figure: Figure) -> None:
-    """Place the axes of a figure that has a layout."""
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        engine.execute(figure)
 
 
 def labelled(ax: Axes, x: str, y: str, title: str = "", **legend: Any) -> Axes:
