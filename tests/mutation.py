@@ -67,7 +67,7 @@ TESTS_OF = {
     "extensions/two_bounces/two_bounces.py": "test_two_bounces",
     "extensions/two_bounces/mirrors.py": "test_two_bounces",
     "propagation/clutter/penumbra.py": "test_penumbra",
-    "propagation/clutter/visibility.py": "test_penumbra test_clutter_field test_clutter_coherence",
+    "propagation/clutter/visibility.py": "test_penumbra test_clutter_field test_truths",
     "propagation/scatter_paths.py": "test_ways test_propagation test_raytrace_scenes",
     "propagation/legs/reflection.py": "test_mirrors test_chains test_raytrace_scenes",
     "propagation/pathset.py": "test_propagation test_ifsignal",

@@ -567,27 +567,11 @@ OF_TESTS = (
         ),
     ),
     (
-        "test_hard_signal::test_beyond_the_filter_there_is_nothing",
-        Bug(
-            "signal/exact.py",
-            "np.maximum(-beat, beat - w.sampling_rate) / w.filter_transition",
-            "np.maximum(-beat, beat - w.sampling_rate) / (2 * w.filter_transition)",
-        ),
-    ),
-    (
         "test_hard_signal::test_velocities_beyond_the_limit_are_aliases_of_a_known_span",
         Bug(
             "receive/estimate.py",
             "column - num_bins // 2 + _hann_ratio(across)",
             "column + _hann_ratio(across)",
-        ),
-    ),
-    (
-        "test_hard_signal::test_a_target_at_half_a_metre",
-        Bug(
-            "signal/tones.py",
-            "near = np.flatnonzero(np.isfinite(radius))",
-            "near = np.flatnonzero(np.zeros_like(radius, bool))",
         ),
     ),
     (

@@ -120,17 +120,17 @@ def test_the_command_writes_its_tables_and_fails_with_a_case(tmp_path, capsys, m
     assert "nonsense" in capsys.readouterr().err
 
 
-GROUPS = ("amplitude", "geometry", "noise", "receivers", "signal", "tracking")
-GROUPS_WITHOUT_RAYS = [
-    c
+QUICK = [
+    pytest.param(c, id=c.name.replace(" ", "-"), marks=[pytest.mark.sionna] * c.tracer)
     for c in all_cases(quick=True)
-    if not c.tracer and not c.package and c.group in GROUPS and c.name != "automatic choice"
+    if c.group not in ("measured", "crosschecks") and c.name != "automatic choice"
 ]
 
 
-@pytest.mark.parametrize("one", GROUPS_WITHOUT_RAYS, ids=lambda c: c.name.replace(" ", "-"))
-def test_quick_cases_without_rays_pass(one):
-    """The rest is run by the command; these are quick enough to stand among the tests."""
+@pytest.mark.parametrize("one", QUICK)
+def test_quick_cases_pass(one):
+    """The rest is run by the command; these are quick enough to stand among the tests, and what
+    they claim no other test repeats."""
     verdict = run_case(one)
     assert verdict.passed, (verdict.error, one.bound, verdict.note)
 

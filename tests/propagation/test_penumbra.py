@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from scipy import special
 from test_clutter_against_sionna import flown as street_of
-from test_clutter_coherence import ROUND_A_CORNER, crossing
-from test_clutter_coherence import flown as flown_round
 from test_clutter_field import LAMBDA, METAL, flown, joined, rectangle, slab
+from truths.clutter import ROUND_A_CORNER, Flight
 
 from isac_rt.propagation.legs.diffraction import edge_factor
 from isac_rt.propagation.legs.edges import ShadowEdges
@@ -141,14 +140,12 @@ def test_power_of_range_cells_with_the_exact_knife_edge(name):
     from somewhere), and to amplitudes in the penumbra: printed. The field's 90th percentile is at
     most 0.1 dB, and its amplitudes are nearer than the others'."""
     if name == "crossing":
-        model, swarm = flown_round(
-            ROUND_A_CORNER, cell_area_per_metre_m=0.15, smallest_cell_m2=0.05
-        )
-        city, times = crossing(), np.linspace(0.6, 4.4, 7)
+        way = Flight(ROUND_A_CORNER, cell_area_per_metre_m=0.15, smallest_cell_m2=0.05)
+        city, model, flight, times = way.city, way.tracer, way.way, np.linspace(0.6, 4.4, 7)
     else:
         city, model, swarm = street_of("munich", 0.2)
-        times = np.linspace(0.4, 2.7, 3)
-    (truth, *others), apart = powers(model, swarm.trajectories["A"], city, times)
+        flight, times = swarm.trajectories["A"], np.linspace(0.4, 2.7, 3)
+    (truth, *others), apart = powers(model, flight, city, times)
     filled = truth > 1e-3 * truth.sum() / len(times)
     found, amplitude = {}, {}
     for kind, power, square in zip(

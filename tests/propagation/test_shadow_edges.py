@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import special
-from test_clutter_coherence import crossing
 from test_clutter_field import METAL, flown, rectangle
 from test_diffraction import chopped
+from truths.clutter import crossing
 
 from isac_rt import scenario
 from isac_rt.frame.link import Link

@@ -15,11 +15,10 @@ from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.arms import element_delays
-from isac_rt.receive.joint.fit import Fit, _Descent, energy, fit, places, residual_channels
+from isac_rt.receive.joint.fit import _Descent, energy, fit, places
 from isac_rt.receive.joint.interaction import IGNORED, TANGENTS, clusters, ignored, shared
 from isac_rt.receive.joint.moments import Moments, _weights
 from isac_rt.receive.joint.neighbours import (
-    _beams,
     _earlier_reference,
     _hidden,
     _widened,
@@ -179,63 +178,6 @@ def model(w, schedule, payload, path: np.ndarray, passes: int) -> np.ndarray:
     return unit * (amplitudes[schedule][:, None, :, None] if passes == 1 else amplitudes[0])
 
 
-@pytest.mark.parametrize("passes", [2, 1])
-def test_normal_equations_are_those_of_the_signal(passes: int):
-    """Gradient Re J^H r and Gram matrix Re J^H J of two paths in neighbouring cells, J by central
-    differences of signals made from points in space (steps of 1e-5 cell: 3e-5 of it); and the noise
-    that the paths leave. Planted bugs: the phase's acceleration by the rate left out; the paths'
-    cross terms conjugated; the ramp of the receivers' delays with the other sign."""
-    w, schedule, payload = frame(waveform=SHORT)
-    rng, count = np.random.default_rng(8), FEW.num_tx if passes == 1 else 1
-    ends = [[68.3, 7.7, 0.31, -0.22], [68.9, 6.9, 0.27, -0.13]]
-    theta = [np.concatenate([e, rng.uniform(0.5, 1.0, 2 * count)]) for e in ends]
-    noise = (
-        rng.standard_normal((*schedule.shape[:1], FEW.num_rx, schedule.shape[1], w.num_samples, 2))
-        @ np.array([1, 1j])
-    ) * 0.1
-    off = np.concatenate([[1e-3, 0.1, 0.02, -0.01], np.full(2 * count, 0.1)])
-    received = (sum(model(w, schedule, payload, t + off, passes) for t in theta) + noise).astype(
-        np.complex64
-    )
-    steps = np.concatenate([[1e-5, 1e-3, 1e-4, 1e-4], np.full(2 * count, 1e-3)])
-    columns = [
-        (
-            model(w, schedule, payload, t + h * one, passes)
-            - model(w, schedule, payload, t - h * one, passes)
-        ).ravel()
-        / (2 * h)
-        for t in theta
-        for h, one in zip(steps, np.eye(len(steps)), strict=True)
-    ]
-    J, left = (
-        np.stack(columns, axis=1),
-        (received - sum(model(w, schedule, payload, t, passes) for t in theta)).ravel(),
-    )
-    paths = [
-        JointPath(
-            t[0] * w.delay_step,
-            t[1] * w.velocity_cell(1) / C,
-            t[2:4],
-            t[4::2] + 1j * t[5::2],
-            np.zeros(4),
-        )
-        for t in theta
-    ]
-    moments = Moments(received, known(w, schedule, payload, FEW, passes))
-    state = _Descent(moments, paths, (), moments.energy)
-    state.paths = list(paths)
-    gradient, gram = state._equations(np.arange(2))
-    power = state.noise
-    size = np.sqrt(np.diag((J.conj().T @ J).real))
-    apart = 1e-3  # curvature of the wavefront, of the chirps between the paths: 4e-4 at most
-    assert np.abs((gram - (J.conj().T @ J).real) / np.outer(size, size)).max() < apart
-    assert np.abs((gradient - (J.conj().T @ left).real) / size).max() < apart * np.linalg.norm(
-        received
-    )
-    assert np.abs((J.conj().T @ left).real / size).max() > 0.2 * np.linalg.norm(left)
-    assert power == pytest.approx((np.abs(left) ** 2).mean(), rel=0.01)
-
-
 def test_a_path_against_its_own_template_has_no_slope():
     """Every chirp at every receiver sums to its amplitude, and weighed by the sample's number to
     nothing: the template has each element's own delay over the whole chirp, and the data. Planted
@@ -249,54 +191,6 @@ def test_a_path_against_its_own_template_has_no_slope():
     zeroth, first = moments.of(Tones.of(sent, [path])[0], Weights.by_chirp(sent))[0, :, 0]
     assert np.abs(zeroth) == pytest.approx(np.abs(zeroth).mean(), rel=1e-3)
     assert np.abs(first).max() < 1e-3 * np.abs(zeroth).mean() * w.num_samples
-
-
-@pytest.mark.parametrize("passes", [2, 1])
-def test_energy_of_a_path_in_the_residual(passes: int):
-    """What a fit leaves holds a second path whole in its own direction and Doppler bin, |b|^2 times
-    all samples, and in noise a beam holds its power, as a sum over the antennas whose departure is
-    free. Planted bugs: Doppler turned the other way; the share of one array; the root of the
-    samples left out."""
-    w, schedule, payload = frame(waveform=SHORT)
-    first = np.array([17.3147, 1.7, 0.31, -0.22, 0.7, 1.0, 0.0, 0.0])
-    second = first + np.array([0, 1.5 * w.velocity_cell(passes), -0.5, 0.43, 0, -0.97, 0, 0])
-    b, direction = second[5], second[2:4]
-    clean = sum(
-        samples(w, schedule, payload, FEW, t[:6] if passes == 2 else t, passes)
-        for t in (first, second)
-    )
-    count = FEW.num_tx if passes == 1 else 1
-    path = JointPath(
-        passes * first[0] / C,
-        passes * first[1] / C,
-        first[2:4],
-        np.full(count, np.exp(0.7j)),
-        np.zeros(4),
-    )
-    offsets = np.array([-1.5, 0.0, 1.5])
-
-    def beams(cube: IFCube) -> tuple[np.ndarray, np.ndarray]:
-        sent = known(w, schedule, payload, FEW, passes)
-        moments = Moments(cube.samples, sent)
-        ((channels, counts),) = residual_channels(moments, Fit([path], 1.0), [path], offsets)
-        grid = np.array([direction, -direction, [0.1, 0.3]])
-        return _beams(sent, path, channels, grid), counts
-
-    quiet = IFCube(
-        samples=clean.astype(np.complex64), waveform=w, schedule=schedule, start_time=0.0
-    )
-    power, counts = beams(quiet)
-    total = clean.size * b**2
-    assert counts.sum() == clean.size
-    assert np.unravel_index(power.argmax(), power.shape) == (0, 2)
-    # the rate's beat slips by 1.5 N T_s / T_frame of a cell over a chirp, the migration is less
-    assert power[0, 2] == pytest.approx(total, rel=0.02)
-    own = samples(w, schedule, payload, FEW, first[:6] if passes == 2 else first, passes)
-    mean = np.mean([beams(noisy(w, schedule, own, 1.0, seed))[0].mean() for seed in range(30)])
-    sums = 1 if passes == 2 else FEW.num_tx
-    assert mean == pytest.approx(
-        sums, rel=5 / np.sqrt(30 * 3 * sums)
-    )  # statistical: of beams and bins alike three are apart
 
 
 def predicted(theta: np.ndarray, w: Waveform) -> Prediction:

@@ -24,7 +24,7 @@ from isac_rt.world.city.materials import Material, resolve_materials, water_perm
 from isac_rt.world.city.materials import MaterialUse as Use
 from isac_rt.world.settings import Rcs
 from truths import stage, truths
-from truths.case import Errors, case, slow_traced, traced
+from truths.case import Errors, case, traced
 from truths.truths import WAVELENGTH, slab_reflection
 
 SIGMA = 10**-1.17
@@ -236,7 +236,7 @@ def _field_power(tx: str, rx: str, poses: dict, city: CityMesh) -> float:
     )
 
 
-@slow_traced(
+@traced(
     "double integral of Lambert's law over the wall",
     "0.02 dB",
     "cells of 0.05 m^2 and up against the integral at 10 m and beyond; metal reflects 0.9998 "
@@ -262,7 +262,7 @@ def lambertian_wall() -> Errors:
         yield abs(10 * np.log10(_field_power(tx, rx, poses, city) / truth))
 
 
-@slow_traced(
+@traced(
     "double integral of Lambert's law over the wall, one end at its image under the ground",
     "0.04 dB",
     "cells of 0.05 m^2 and up against the integral, 0.02 dB; metal ground takes 0.4 % of a "

@@ -19,7 +19,7 @@ from isac_rt.simulation.setup import prepare, propagation_in, swarm_of
 from isac_rt.world.city import CityMesh, load_city
 from isac_rt.world.swarm import Pose
 from truths import truths
-from truths.case import Errors, slow_traced, traced
+from truths.case import Errors, traced
 from truths.truths import WAVELENGTH
 
 CELL = 0.25
@@ -100,8 +100,9 @@ class Flight:
             "clutter": {"model": "field", **clutter},
         }
         s = Scenario.model_validate(tree)
-        self.city = _crossing()
-        self.field = propagation_in(self.city, s).field  # type: ignore[attr-defined]  # a ray tracer
+        self.city = crossing()
+        self.tracer: Any = propagation_in(self.city, s)
+        self.field = self.tracer.field
         self.way = swarm_of(s).trajectories["A"]
 
     def pose(self, time: float) -> Pose:
@@ -124,7 +125,8 @@ class Flight:
 
 
 @cache
-def _crossing() -> CityMesh:
+def crossing() -> CityMesh:
+    """Four blocks of metal about two streets."""
     s = Scenario.model_validate(
         {
             "swarm": {"A": {"role": "active", "position_m": [0, 0, 5]}},
@@ -188,7 +190,7 @@ def _separate(flight: Flight, caster: Any, place: np.ndarray) -> np.ndarray:
     )
 
 
-@slow_traced(
+@traced(
     "float64 sum over the list of scatterers, sight by trimesh's ray caster at every place",
     "0.01 of one",
     "the separate sum switches at shadow edges, the field crosses them by the knife edge's factor",
@@ -219,7 +221,7 @@ def coherence_of_the_clutter_field() -> float:
     return 1 - worst
 
 
-@slow_traced(
+@traced(
     "the same cell with the sight of one frame before, in a sum of its own; mean power over "
     "2 m and 15 frames",
     "0.15 of the local rms",
@@ -256,7 +258,7 @@ def sight_alone_changes_no_range_cell_at_once() -> float:
     )
 
 
-@slow_traced(
+@traced(
     "the exponential law of |sum|^2 over its mean (Kolmogorov and Smirnov), and its tail "
     "beyond 5 and 8 times the mean",
     "1 of the bounds",
@@ -290,7 +292,7 @@ def speckle_of_range_doppler_cells() -> float:
     return max(worst) if sample.size > 3_000 else np.inf
 
 
-@slow_traced(
+@traced(
     "2 v.u/lambda of the scatterers' places, two Doppler cells to either side",
     "0.02 of a cell's energy",
     "a Hann window's main lobe is four cells wide and holds all but 1e-4; speckle may leave "
@@ -370,7 +372,7 @@ def noise_and_merged_clutter() -> Errors:
             yield float(np.quantile(off, 0.9))
 
 
-@slow_traced(
+@traced(
     "Sionna RT's diffuse solution with 1e6 rays, over cells of 4 m that hold a thousandth of "
     "the power",
     "1 of the bounds",

@@ -86,7 +86,7 @@ def _dpsk_theory(order: int, snr: float, branches: int) -> float:
     return 2 * (0.5 + quad(density, 0, np.inf, limit=2000)[0] / np.pi)
 
 
-@slow(
+@case(
     "characteristic function of the detector's Hermitian form, inverted",
     "4.5 sigma",
     ONCE_IN_1E5 + "; neighbouring symbols share a chirp, which at most doubles the variance",
@@ -100,7 +100,7 @@ def dpsk_symbol_errors() -> Errors:
         yield abs(wrong / total - rate) / np.sqrt(2 * rate * (1 - rate) / total)
 
 
-@slow(
+@case(
     "M-ary orthogonal signals with three square-law branches: an integral over the "
     "noncentral chi-square law",
     "4.5 sigma",
@@ -288,7 +288,7 @@ def false_alarms_of_the_whole_chain() -> float:
 # ---- estimates
 
 
-@slow(
+@case(
     "range, velocity and direction that the cube was made with",
     "0.002 of a resolution",
     "element delays of opposite sign do not cancel in the summed power, 2e-4 m; plane waves in "
@@ -318,7 +318,7 @@ def _loss(window: np.ndarray) -> tuple[float, float]:
     return float((window**2 * x**2).sum() / (window * x**2).sum() ** 2 / 2 / (4 * np.pi**2)), bound
 
 
-@slow(
+@case(
     "Cramer-Rao bound of a tone over channels of unknown phase, with the Hann windows' loss by "
     "first-order perturbation",
     "4.5 sigma",

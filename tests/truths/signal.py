@@ -203,7 +203,7 @@ def _against_exact(
             yield stage.relative(found, truth)
 
 
-@slow("the exact model, which has cases of its own", "2e-7 relative", COMPLEX64)
+@case("the exact model, which has cases of its own", "2e-7 relative", COMPLEX64)
 def direct_method() -> Errors:
     """The direct method over K = 1, 4, 30 paths, 0 to 30 m/s, with and without data."""
     return _against_exact(Direct(), (1, 4, 30))
