@@ -41,3 +41,15 @@ def scenario(**change) -> Scenario:
         "cooperation": "tracks",
     }
     return Scenario(**base | change)
+
+
+def small(**change) -> Scenario:
+    """The same with few small frames, that say nothing to each other: for what a run does around
+    its frames."""
+    base = {
+        "frames": 3,
+        "radio": Radio(samples_per_chirp=64, bandwidth_hz=320e6, chirps_per_frame=24),
+        "array": Array(rx_x=2, rx_z=2),
+        "cooperation": "none",
+    }
+    return scenario(**base | change)

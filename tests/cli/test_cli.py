@@ -157,6 +157,13 @@ def simulation(monkeypatch):
     return fake
 
 
+@pytest.fixture
+def undrawn(simulation, monkeypatch):
+    """Pictures take longer than all else."""
+    monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
+    return simulation
+
+
 def test_run_writes_everything(scenario_file, simulation, tmp_path, capsys):
     assert (
         main(
@@ -188,10 +195,9 @@ def test_run_writes_everything(scenario_file, simulation, tmp_path, capsys):
 
 
 def test_results_of_another_scenario_are_replaced_only_when_asked(
-    scenario_file, simulation, tmp_path, monkeypatch, capsys
+    scenario_file, undrawn, tmp_path, capsys
 ):
     """The same scenario may be run again. Planted bug: only seeds compared."""
-    monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
     out = tmp_path / "out"
     command = ["run", str(scenario_file), "--out", str(out)]
     assert main(command) == 0
@@ -208,7 +214,7 @@ def test_results_of_another_scenario_are_replaced_only_when_asked(
     assert json.loads((out / "summary.json").read_text())["seed"] == 42
 
 
-def test_a_folder_is_of_one_run_at_a_time(scenario_file, simulation, tmp_path, capsys):
+def test_a_folder_is_of_one_run_at_a_time(scenario_file, undrawn, tmp_path, capsys):
     """From before it is looked at. Planted bug: held while results are written only."""
     out = tmp_path / "out"
     out.mkdir()
@@ -224,7 +230,7 @@ def test_room_is_asked_for_before_a_run(scenario_file, simulation, tmp_path, mon
     assert "MB are free" in capsys.readouterr().err
 
 
-def test_demo_needs_no_file(simulation, tmp_path, monkeypatch, capsys):
+def test_demo_needs_no_file(undrawn, tmp_path, monkeypatch, capsys):
     """In an empty folder: the scenario beside its results, and what to do next; called again it
     keeps what was changed. Planted bug: the scenario written anew."""
     monkeypatch.chdir(tmp_path)
@@ -238,8 +244,7 @@ def test_demo_needs_no_file(simulation, tmp_path, monkeypatch, capsys):
     assert (summary["seed"], summary["frames"]) == (17, 12)
 
 
-def test_set_reaches_the_scenario(scenario_file, simulation, tmp_path, monkeypatch):
-    monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
+def test_set_reaches_the_scenario(scenario_file, undrawn, tmp_path):
     assert (
         main(
             [
@@ -320,7 +325,7 @@ def test_view_draws_a_picture(scenario_file, simulation, tmp_path):
 
 @pytest.mark.parametrize("columns", [None, 80, 140])
 def test_titles_keep_their_units_on_the_screen(
-    columns, scenario_file, simulation, tmp_path, capsys, monkeypatch
+    columns, scenario_file, undrawn, tmp_path, capsys, monkeypatch
 ):
     """On terminals of 80 and 140 columns and without one. Planted bug: `Console()`, for which
     "range [m]" is "range" in the style m."""
@@ -343,7 +348,7 @@ def test_titles_keep_their_units_on_the_screen(
         assert max(map(len, tables)) <= columns
 
 
-def test_warnings_are_said_as_they_stand(scenario_file, simulation, tmp_path, capsys):
+def test_warnings_are_said_as_they_stand(scenario_file, undrawn, tmp_path, capsys):
     """Planted bug: warnings printed as markup."""
     changes = ["--set", "radio.carrier_hz=9e8", "--out", str(tmp_path / "o")]
     assert main(["run", str(scenario_file), *changes]) == 0

@@ -19,12 +19,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from fake_run import fake_run, fake_scenario
+from talking import small
 
 from isac_rt import storage
 from isac_rt.cli.cli import main
 from isac_rt.results.files import save
 from isac_rt.scenario.file import load, to_yaml
-from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.storage import StorageError, write_whole
 
@@ -143,29 +143,6 @@ def test_an_unwritable_folder_is_refused_before_the_run(tmp_path, capsys):
     assert main(["run", str(scenario), "--out", str(tmp_path / "file" / "o")]) == 2
     said = capsys.readouterr().err
     assert "cannot write" in said and len(said.strip().splitlines()) == 1
-
-
-def small() -> Scenario:
-    return Scenario.model_validate(
-        {
-            "frames": 3,
-            "radio": {"samples_per_chirp": 64, "chirps_per_frame": 24},
-            "modulation": {"acquisition_frames": 1},
-            "array": {"rx_x": 2, "rx_z": 2},
-            "noise": {"model": "snr", "snr_db": 5.0},
-            "swarm": {
-                "A": {"role": "active", "position_m": [0, 0, 9]},
-                "P": {"role": "passive", "position_m": [1.3, 8.1, 9.3], "boresight": [0, -1, 0]},
-                "Q": {
-                    "role": "passive",
-                    "position_m": [-2.3, 6.1, 9.3],
-                    "velocity_mps": [1, 2, 0],
-                    "boresight": [0, -1, 0],
-                },
-                "U": {"role": "target", "position_m": [0.4, 4.1, 9.3], "velocity_mps": [0, 1, 0]},
-            },
-        }
-    )
 
 
 def digest(run) -> str:

@@ -16,6 +16,7 @@ PLUGINS = ("scene", "sphere", "diffuse", "uniform", "independent")
 SMALL = """\
 city: {source: canyon}
 frames: 4
+radio: {samples_per_chirp: 64, chirps_per_frame: 12}
 swarm:
   A: {role: active, position_m: [0, 0, 12]}
   T: {role: target, position_m: [5, 9, 10]}

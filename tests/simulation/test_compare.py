@@ -9,7 +9,7 @@ import json
 import numpy as np
 import pytest
 from test_fall_back import scenario as dense_scenario
-from test_resume import SCENES, Stopped, assert_equal_results, stopping_at
+from test_resume import SCENES, SMALL, Stopped, assert_equal_results, stopping_at
 
 from isac_rt.results.losses import LOSSES
 from isac_rt.results.provenance import run_content
@@ -20,7 +20,7 @@ from isac_rt.simulation.setup import prepare
 from isac_rt.views.report import write_report
 from isac_rt.views.tables import city_costs, side_by_side
 
-SHORT = ["modulation.acquisition_frames=2", "receivers.active_every_frames=2"]
+SHORT = ["modulation.acquisition_frames=2", "receivers.active_every_frames=2", *SMALL]
 SETS = [
     "compare.paper.preset=paper",
     "compare.beams={receivers: {symbol_decision: beams}, tracking: {confirm_hits: 2}}",

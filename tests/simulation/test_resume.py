@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from talking import small
 from test_fall_back import scenario as dense_scenario
 
 from isac_rt.cli.cli import main
@@ -36,6 +37,7 @@ from isac_rt.track.settings import Tracking
 
 ROOT = Path(__file__).parents[2]
 SCENES = ROOT / "scenes"
+SMALL = ["radio.samples_per_chirp=256", "radio.chirps_per_frame=36"]
 
 
 class Stopped(Exception):
@@ -70,7 +72,7 @@ def scenarios():
         "access": lambda: load(SCENES / "access_swarm.yaml", access),
         "canyon": lambda: load(
             SCENES / "street_canyon.yaml",
-            ["modulation.acquisition_frames=1"],
+            ["modulation.acquisition_frames=1", *SMALL],
             frames=3,
         ),
     }
@@ -110,7 +112,7 @@ def test_frames_are_kept_while_receivers_are_at_work_on_later_ones(tmp_path, mon
     to the same bits. Planted bugs: what a terminal carries after the later frame is kept; that of
     a terminal which the frame passes over is."""
     every_second = ["receivers.active_every_frames=2", "modulation.acquisition_frames=2"]
-    scenario = load(SCENES / "paper_swarm_consistent.yaml", every_second, frames=6)
+    scenario = load(SCENES / "paper_swarm_consistent.yaml", every_second + SMALL, frames=6)
     assert len(prepare(scenario).timetable.links(1)) < len(prepare(scenario).timetable.all_links)
     whole = simulate.run(scenario, snapshots=1)
     collect = simulate._Run.collect
@@ -200,7 +202,7 @@ def test_everything_that_is_carried_over_is_taken_up(tmp_path):
 
 def test_a_run_with_all_but_its_last_frame_kept_hears_that_one_alone(tmp_path, monkeypatch):
     """Nothing is received twice."""
-    scenario = dense_scenario(frames=4)
+    scenario = small(frames=4)
     resume = Resume(tmp_path, run_content(scenario, 1), every=0.0)
     whole = simulate.run(scenario, snapshots=1, resume=resume)
     heard = []
@@ -332,7 +334,7 @@ def test_a_file_from_elsewhere_is_refused_with_one_message(tmp_path, spoil):
     ],
 )
 def test_an_entry_that_is_no_runs_is_refused_before_a_frame(tmp_path, entry):
-    scenario = dense_scenario(frames=4)
+    scenario = small(frames=4)
     resume = Resume(tmp_path, run_content(scenario, 1))
     resume.append(entry)
     with pytest.raises(ResumeError, match=r"not written by isac-rt.*--restart lets go"):
@@ -401,7 +403,7 @@ def test_what_cannot_be_kept_does_not_end_the_run_nor_take_away_what_was(tmp_pat
 
 def test_frames_that_could_not_be_kept_are_kept_with_the_next(tmp_path, monkeypatch):
     """Planted bug: frames taken for kept before they are."""
-    scenario = dense_scenario(frames=5)
+    scenario = small(frames=5)
     whole = simulate.run(scenario, snapshots=1)
     resume = Resume(tmp_path, run_content(scenario, 1), every=0.0)
     append, tries = resume.append, iter([False, True, False, True])
@@ -415,7 +417,7 @@ def test_frames_that_could_not_be_kept_are_kept_with_the_next(tmp_path, monkeypa
 def test_frames_that_two_calls_kept_are_taken_up_once(tmp_path):
     """Two calls of one run at the same time keep the same frames, each in pieces of its own:
     what does not follow on is passed over. Planted bug: every entry taken."""
-    scenario = dense_scenario(frames=5)
+    scenario = small(frames=5)
     whole = simulate.run(scenario, snapshots=1)
     folders = [tmp_path / name for name in ("one", "two", "both")]
     for folder in folders:
@@ -480,12 +482,18 @@ def test_a_schema_from_elsewhere_is_not_trusted(tmp_path):
         assert database.execute("PRAGMA trusted_schema").fetchall() == [(0,)]
 
 
+def keep_every_frame(monkeypatch):
+    """And draw nothing."""
+    monkeypatch.setattr(Resume.__init__, "__defaults__", (0.0,))
+    monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
+    monkeypatch.setattr("isac_rt.views.report.write_report", lambda *_: None)
+
+
 def test_the_command_says_what_it_keeps_and_goes_on(tmp_path, monkeypatch, capsys):
     """Ctrl-C after three frames: exit 130 and where they are; another scenario leaves them alone
     unless told to let go; the next call says that it goes on, and leaves no such file behind."""
-    (tmp_path / "scene.yaml").write_text(to_yaml(dense_scenario(frames=4)))
-    monkeypatch.setattr(Resume.__init__, "__defaults__", (0.0,))
-    monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
+    (tmp_path / "scene.yaml").write_text(to_yaml(small(frames=4)))
+    keep_every_frame(monkeypatch)
 
     def stopped(work, *_):
         def report(done, total):
@@ -533,9 +541,8 @@ def test_whatever_ends_a_run_keeps_what_is_done(
 ):
     """One message, the exit code, where the frames are; the next call goes on. Planted bug: said
     on Ctrl-C only."""
-    (tmp_path / "scene.yaml").write_text(to_yaml(dense_scenario(frames=4)))
-    monkeypatch.setattr(Resume.__init__, "__defaults__", (0.0,))
-    monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
+    (tmp_path / "scene.yaml").write_text(to_yaml(small(frames=4)))
+    keep_every_frame(monkeypatch)
     hear = stations.Station.receive
 
     def broken(self, frame, *rest):
@@ -558,9 +565,7 @@ def test_a_run_on_a_full_disk_goes_on_once_there_is_room(tmp_path, small_disk, m
     written (exit 2, one message, no half file): then the same command goes on to the same bits.
     Planted bug: the kept frames removed when no more can be."""
     (tmp_path / "scene.yaml").write_text(to_yaml(dense_scenario(frames=5)))
-    monkeypatch.setattr(Resume.__init__, "__defaults__", (0.0,))
-    monkeypatch.setattr("isac_rt.views.figures.make_figures", lambda *_: [])
-    monkeypatch.setattr("isac_rt.views.report.write_report", lambda *_: None)
+    keep_every_frame(monkeypatch)
     monkeypatch.setattr("isac_rt.results.files.ROOM_BYTES", 0)
     disk = small_disk(64)
     out = disk / "out"
@@ -591,7 +596,7 @@ def test_the_command_goes_on_after_it_was_stopped(tmp_path, how):
     """From outside, once an entry is written: the message, the frames taken up, the same results,
     and no file left behind."""
     scenario = tmp_path / "scene.yaml"
-    scenario.write_text(to_yaml(dense_scenario(frames=8)))
+    scenario.write_text(to_yaml(small(frames=8)))
     out = tmp_path / "out"
     program = f"""
 import sys, isac_rt.simulation.resume
@@ -613,4 +618,4 @@ sys.exit(main(["run", {str(scenario)!r}, "--out", {str(out)!r}]))
     again = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=300)
     assert again.returncode == 0 and "resuming after the frames" in again.stderr
     assert not (out / FILE).exists()
-    assert_equal_results(open_results(out), simulate.run(dense_scenario(frames=8)))
+    assert_equal_results(open_results(out), simulate.run(small(frames=8)))

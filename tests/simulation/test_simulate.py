@@ -17,7 +17,6 @@ from threadpoolctl import threadpool_limits
 from isac_rt import runtime
 from isac_rt.extensions.city_receivers.standard import passive_terminal
 from isac_rt.propagation.pathset import PathKind
-from isac_rt.results.files import open_results, save
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare
@@ -79,20 +78,6 @@ def test_snr_is_that_of_the_scenario(paper):
     """10 dB per sample at every frame for the reference path; published, exact but for rounding."""
     snr = paper.dataset.reference_snr.sel(observer="PT1").values
     assert 10 * np.log10(snr) == pytest.approx(np.full(6, 10.0), abs=1e-9)
-
-
-def test_results_are_the_same_whatever_the_threads(paper, monkeypatch, tmp_path):
-    """One thread instead of the machine's: every variable bit-identical, also after saving. Planted
-    bug: a shared generator."""
-    monkeypatch.setattr(os, "cpu_count", lambda: 1)
-    again = simulate.run(
-        load(SCENES / "paper_swarm_consistent.yaml", ["modulation.pilot_every_frames=4"], **FRAMES)
-    )
-    save(again, tmp_path / "run")
-    again = open_results(tmp_path / "run")
-    for name, variable in paper.dataset.variables.items():
-        other = again.dataset[name].values
-        assert np.array_equal(variable.values, other, equal_nan=variable.dtype.kind == "f"), name
 
 
 def test_receivers_use_no_truth(tmp_path):
