@@ -24,7 +24,6 @@ from isac_rt.receive.cfar import (
 )
 from isac_rt.receive.chain import passive_detector_of
 from isac_rt.receive.estimate import (
-    STENCILS,
     LocalSpectra,
     directions,
     excess,
@@ -41,7 +40,6 @@ from isac_rt.receive.maps import (
     accumulate,
     channel_maps,
     correlation_operator,
-    slow_window,
 )
 from isac_rt.receive.omp import Omp
 from isac_rt.receive.passive import receive_passive
@@ -216,38 +214,6 @@ def test_peaks_that_lobes_explain_are_those_of_plain_numpy():
         keep[i] = not (power[rows[i], bins[i]] <= bound).any()
     assert 50 < keep.sum() < 150
     assert without_sidelobes(rows, bins, power, 120, 1e-5).tolist() == keep.tolist()
-
-
-@pytest.mark.parametrize(
-    "place", [14.37, 14.0, 14.0 - Waveform().num_samples / Waveform().window_length]
-)
-def test_compiled_match_is_the_template(place: float):
-    """In general, and in the middle of a row and at the end of its lobe, where the window's
-    transform is 0/0. Planted bugs: Doppler without the data delay, phase at the first sample,
-    window's transform about its start; 1 or 0/0 at the end of a lobe."""
-    w, schedule, _ = frame()
-    spectra = (
-        np.random.default_rng(2)
-        .standard_normal((3, 2, 30, 120, 2))
-        .astype(np.float32)
-        .view(np.complex64)[..., 0]
-    )
-    tau, rate, row = place * w.delay_step, 3.1e-8 * (place == 14.37), 14
-    got = LocalSpectra(spectra, known(w, schedule, unmodulated(w)), row).respond(tau, rate)
-    rows = np.arange(row - 3, row + 4)
-    shape = hann_response(w, w.beat_cells(tau, rate)[..., None] - rows)
-    turn = w.phase(tau + rate * w.middle_time, w.window_middle)[..., None] - rows * (
-        w.window_length / 2 / w.num_samples
-    )
-    template = shape * np.exp(2j * np.pi * turn)
-    for tx in range(3):
-        weight = (schedule == tx) * slow_window(w)
-        expected = (
-            np.einsum("mxkp,mpk,mp->x", spectra[:, :, rows], template.conj(), weight)
-            / (shape**2 * weight[..., None]).sum()
-        )
-        single = 3e-6  # sums of 840 terms in single precision that nearly cancel
-        assert np.abs(got[tx] - expected).max() < single * np.abs(expected).max()
 
 
 def test_window_transform_is_closed_form():
@@ -489,46 +455,6 @@ def test_start_point_is_near_and_refinement_moves_to_the_truth():
         and abs(found.delay_rate * SPEED_OF_LIGHT - 9.21) < 1e-5
     )
     assert np.abs(np.abs(found.channels) - 1).max() < 2e-3  # the amplitude of a sample
-
-
-def climbed(local: LocalSpectra, delay: float, delay_rate: float) -> tuple[float, float]:
-    """`refine` by numpy, with a solver for the top of the paraboloid."""
-    w = local.waveform
-    units = np.array([w.delay_step, 1 / (w.frame_duration * w.effective_carrier)])
-    coupling = np.array([[1.0, -w.sampled_duration / w.frame_duration], [0.0, 1.0]])
-    place, hxy = np.linalg.solve(coupling, np.array([delay, delay_rate]) / units), None
-    offsets = np.array(
-        [[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1], [1, -1], [1, 1]]
-    )
-    for step in STENCILS:
-        tried = (place + step * offsets) @ coupling.T * units
-        g = np.log(local.powers(*np.ascontiguousarray(tried.T)))
-        gradient = np.array([g[2] - g[1], g[4] - g[3]]) / (2 * step)
-        hxx, hyy = g[2] - 2 * g[0] + g[1], g[4] - 2 * g[0] + g[3]
-        hxy = (g[8] - g[7] - g[6] + g[5]) / 4 / step**2 if hxy is None else hxy
-        curvature = np.array([[hxx / step**2, hxy], [hxy, hyy / step**2]])
-        up = np.linalg.eigvalsh(curvature).max() < 0
-        move = -np.linalg.solve(curvature, gradient) if up else np.copysign(step, gradient)
-        place = place + np.clip(move, -3 * step, 3 * step)
-    return tuple((coupling @ place * units).tolist())
-
-
-@pytest.mark.parametrize("beam", [None, True, False])
-def test_refinement_is_that_of_plain_numpy(beam: bool | None):
-    """Paths near the ends of the range axis and within, in noise, by all channels or by a beam in
-    phase or not. Planted bugs: the mixed derivative of the last stencil; no limit of the move."""
-    w, schedule, payload = frame(waveform=Waveform(num_samples=256, num_chirps=36))
-    rng, sent = np.random.default_rng(5), known(w, schedule, payload, FEW)
-    paths = [Path(2 * r * w.range_cell(2), 3.1, 1.0) for r in (1.3, 60.4, 125.6)]
-    spectra = clean_spectrum(cube(w, schedule, payload, paths, FEW, noise=0.3, seed=2), sent)
-    towards = None if beam is None else rng.standard_normal((w.num_tx, 3, 2)) @ [1, 1j]
-    for row in (1, 60, 126):
-        local = LocalSpectra(spectra, sent, row, beam=towards, in_phase=bool(beam))
-        start = (row + 0.4) * w.delay_step, 2e-8
-        found, expected = refine(local, *start), climbed(local, *start)
-        # rounding of logarithms over the squared step
-        assert (found.delay, found.delay_rate) == pytest.approx(expected, rel=1e-9, abs=1e-18)
-        assert np.array_equal(found.channels, local.respond(found.delay, found.delay_rate))
 
 
 @pytest.mark.parametrize("curvature", [[[3.1, 1.7], [1.7, 2.3]], [[2.3, -1.1], [-1.1, 4.7]]])

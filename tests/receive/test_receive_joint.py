@@ -28,8 +28,6 @@ from isac_rt.receive.joint.tones import (
     JointPath,
     Tones,
     Weights,
-    cross_sums,
-    own_sums,
     rate_bin,
     units,
 )
@@ -66,42 +64,6 @@ def tones_of(rng: np.random.Generator, frequency: np.ndarray, size: int) -> Tone
     middle = carrier.mean(axis=(1, 2))
     cycles = rng.uniform(-2, 2, shape)
     return Tones(cycles, frequency, carrier, middle, delay, slope, interval, float(size))
-
-
-@pytest.mark.parametrize("reach", [0.0, 1e-4, 0.3, 3.0])
-def test_sums_of_tones(reach: float):
-    """Of T' T* n^q g over samples and chirps, against the sums written out, for tones whose
-    frequencies stay apart by as much as they do, or by up to `reach` cells more from chirp to
-    chirp, with receivers of other delays, where the series takes over too, and of a tone with
-    itself. Planted bugs: the sign of the second moment; the ramp of one receiver at all; the wobble
-    turned the other way; a Chebyshev node too few (3 cells)."""
-    rng, places = np.random.default_rng(2), 3
-    for size, distance in ((24, 0.0), (101, 0.011), (101, -1.7), (24, 0.5)):
-        base = rng.uniform(0, 0.4, (2, 8))
-        apart = (distance + reach * rng.uniform(-1, 1, (2, 2, 8))) / size
-        tones = tones_of(rng, np.concatenate([base[None], base + apart]), size)
-        factors = rng.standard_normal((2, 2, 8, 2)) @ [1, 1j]
-        place = rng.permuted(np.arange(16) % places).reshape(2, 8)
-        weights = Weights(factors, place, places)
-        n = np.arange(size) - (size - 1) / 2
-        late = tones.delay[:, None, None]
-        angle = tones.cycles[..., None] + late * tones.carrier[..., None]
-        angle = angle - tones.slope * late**2 / 2
-        ramped = tones.frequency[..., None] + late * tones.slope * tones.interval
-        signals = np.exp(2j * np.pi * (angle[..., None] + ramped[..., None] * n))
-        pairs = np.array([[0, 1], [2, 0]])
-        sums = cross_sums(tones, pairs, weights)
-        # of the largest: what the series' two terms and the wobble's three leave
-        limit = 4e-6 * np.abs(factors).sum()
-        for (k, j), mine in zip(pairs, sums, strict=True):
-            both = signals[j] * signals[k].conj()
-            for q in range(3):
-                each = factors[..., None] * (both @ n**q)
-                exact = np.stack([each[:, place == a].sum(axis=1) for a in range(places)], axis=1)
-                assert np.abs(mine[q] - exact).max() < limit * size ** (q + 1)
-        real = weights._replace(factors=factors.real.astype(complex))
-        own, itself = own_sums(size, real), cross_sums(tones, np.array([[1, 1]]), real)[0]
-        assert itself == pytest.approx(np.repeat(own, 3, axis=3), abs=1e-9 * size**3)
 
 
 def test_elements_hear_a_spherical_wave():

@@ -12,11 +12,8 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.cfar import peaks
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import (
-    correlation_operator,
-    maps_with_power,
     power_map,
     slow_window,
-    union_operator,
 )
 from isac_rt.receive.spectrum import _factors, tones, transform, transform_plain
 
@@ -121,33 +118,6 @@ def test_power_map_is_the_mean_over_antennas(groups: int, chirps: int):
     # rounds
     tolerance = 3e-3 if groups == 3 else 1e-5
     assert np.abs(np.sqrt(got) - np.sqrt(expected)).max() < tolerance * np.sqrt(expected.max())
-
-
-@pytest.mark.parametrize("groups", [3, 2])
-@pytest.mark.parametrize("chirps", [30, 33, 36])
-@pytest.mark.parametrize("rows", [1, 26, 50])
-def test_maps_are_the_products_with_the_operators(groups: int, chirps: int, rows: int):
-    """Rows of more than one pass through the cache, alone, or not in threes; bins that fill their
-    registers (P = 30) and do not.
-
-    Planted bugs: the last of three rows left out at the end; the opposite bins one further.
-    """
-    w, rng = Waveform(num_groups=groups, num_chirps=chirps), np.random.default_rng(9)
-    schedule = pseudo_random_schedule(groups, chirps, w.num_tx, rng)
-    symbols = rng.integers(0, w.num_delay_symbols, schedule.shape)
-    known = Known(w, schedule, symbols, np.ones(schedule.shape, complex), ANTENNAS, 2)
-    spectra = drawn(rng, groups, 2, rows, chirps).astype(np.complex64)
-    operator = union_operator if groups == 3 else correlation_operator
-    expected = np.zeros((w.num_tx, 2, rows, chirps), complex)
-    for tx in range(w.num_tx):
-        sent = schedule == tx
-        seen = spectra.transpose(1, 2, 0, 3)[:, :, sent].astype(complex)
-        expected[tx] = seen @ operator(w, known.slots[sent]).T
-    maps, power = maps_with_power(spectra, known)
-    assert np.abs(maps - expected).max() < 3e-6 * np.abs(expected).max()  # 36 sums in float32
-    mean = np.fft.fftshift((np.abs(expected) ** 2).mean(axis=(0, 1)), axes=1)
-    assert np.abs(power - mean).max() < 3e-6 * mean.max()
-    assert np.array_equal(power_map(spectra, known), power)
 
 
 @pytest.mark.parametrize("reach", [(1, 1), (8, 8), (2, 40)])

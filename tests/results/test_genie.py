@@ -17,8 +17,8 @@ from isac_rt.simulation.stations import Station, standard_terminal
 SCENE = Path(__file__).parents[2] / "scenes" / "munich_swarm.yaml"
 C, BOLTZMANN = 299_792_458.0, 1.380649e-23
 FRAME = 40
-EVERY = 4
-"""Every fourth sample is summed: what is left of the phases within a chirp is under 1e-3 cycles."""
+EVERY = 16
+"""Every sixteenth sample is summed: what is left of the phases in a chirp is under 1e-3 cycles."""
 TOLERANCE_DB = 0.01
 """The number that is stated is energy over noise alone. The plane wave and the constant rates of
 the filter below cost up to 0.0025 dB in 14 target-frames of 12 m and more: the wave's curvature

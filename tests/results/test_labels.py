@@ -7,13 +7,10 @@ import pytest
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
-from isac_rt.receive.maps import UNION_FLOOR
 from isac_rt.receive.types import Detections
 from isac_rt.results.labels import (
     EXPLAINS,
     Aim,
-    Explanation,
-    Places,
     explain,
     hann_response,
     owners,
@@ -220,60 +217,6 @@ def test_whose_path_it_is():
     assert owners(at_at.kind, at_at.target, at_at, names).tolist() == [4, -1, -1, 1]
 
 
-def rows_of(places, rows):
-    return places._replace(range=places.range[rows], velocity=places.velocity[rows])
-
-
-def plainly(detections, paths, waveform, passes, cell_gain, aim=None) -> Explanation:
-    """`explain` detection by detection, with arrays."""
-    places, power = Places.of(paths, waveform, passes), paths.power * cell_gain
-    diffuse = paths.kind == PathKind.DIFFUSE
-    others, field_rows = np.flatnonzero(~diffuse), np.flatnonzero(diffuse)
-    field_rows = field_rows[np.argsort(places.range[field_rows], kind="stable")]
-    ranges = places.range[field_rows]
-    beside = places.cells[0] * (1 + 1e-9)  # what is a cell away to the last digit is asked later
-    count = len(detections)
-    apart = rows_of(places, others).apart(detections.range[:, None], detections.velocity[:, None])
-    along, across = (reach(d) for d in apart)
-    shares = along * np.minimum(across + UNION_FLOOR, 1.0)
-    close = (apart[0] <= 1) & (apart[1] <= 1)
-    kinds, targets, orders, faces = (
-        np.full(count, -1, dtype) for dtype in (np.int8, np.int16, np.int16, np.int32)
-    )
-    out = Explanation(kinds, targets, orders, faces, np.zeros(count, bool))
-    for q in range(count):
-        at = detections.range[q]
-        first, last = np.searchsorted(ranges, [at - beside, at + beside])
-        around = np.sort(field_rows[first:last])
-        some = np.sort(np.concatenate([others, around]))
-        field, own = diffuse[some], power[some]
-        rows, bins = rows_of(places, around).apart(at, detections.velocity[q])
-        near = np.zeros(some.size, bool)
-        near[field], near[~field] = (rows <= 1) & (bins <= 1), close[q]
-        here = np.where(field, 0.0, own)
-        here[~field] *= shares[q]
-        clutter = np.where(near & field, own, 0.0)
-        best = -1
-        if aim is not None:
-            off = np.abs(aim.direction[some] - detections.direction[q]) / aim.beam
-            off = off.max(axis=1)
-            towards = off <= 1
-            best = strongest(np.where(towards, here, 0.0), np.where(towards, clutter, 0.0))
-            if best >= 0 and not near[best]:
-                towards &= near & (off < off[best])
-                best = strongest(np.where(towards, here, 0.0), np.where(towards, clutter, 0.0))
-        if best < 0 or not near[best]:
-            best = strongest(here, clutter)
-        if best < 0:
-            continue
-        cause = some[best]
-        out.kind[q], out.target[q] = paths.kind[cause], paths.target[cause]
-        out.order[q], out.sidelobe[q] = paths.bounces[cause], not near[best]
-        met = paths.faces[cause][paths.faces[cause] >= 0]
-        out.face[q] = met[0] if met.size else -1
-    return out
-
-
 def strongest(power: np.ndarray, clutter: np.ndarray) -> int:
     """The path of most power, -1 if none explains anything; all clutter counts as its
     strongest."""
@@ -281,46 +224,3 @@ def strongest(power: np.ndarray, clutter: np.ndarray) -> int:
     if clutter.any():
         power[np.argmax(clutter)] = clutter.sum()
     return int(np.argmax(power)) if power.size and power.max() >= EXPLAINS else -1
-
-
-@pytest.mark.parametrize("looks", [False, True])
-def test_causes_are_those_of_a_plain_loop(looks):
-    """Forty frames of crowded cells, with paths and detections an alias apart and directions that
-    are not known. Planted bugs: velocities not taken modulo the span; what is farther off than the
-    best one from this direction counted too; clutter as the last path of a cell, not the
-    strongest."""
-    rng, explained, skirts = np.random.default_rng(11), 0, 0
-    for _ in range(40):
-        count = 300
-        rows = [
-            (
-                20 + RANGE * rng.uniform(-4, 4),
-                VELOCITY * rng.uniform(-60, 60) if k % 7 else VELOCITY * rng.uniform(-2, 2),
-                10 ** rng.uniform(-4, 0.5),
-                int(rng.choice([0, 1, 2, 3, 4, 4, 4, 4, 4, 4, 4, 4])),
-                int(rng.integers(-1, 3)),
-            )
-            for k in range(count)
-        ]
-        found = paths(
-            rows,
-            link=("AT", "PT1"),
-            bounces=rng.integers(0, 3, count),
-            faces=rng.integers(-3, 40, (count, 3)).clip(-1),
-            points=np.zeros((count, 3, 3)),
-        )
-        towards = rng.uniform(-0.7, 0.7, (30, 2))
-        towards[:4, 1] = np.nan
-        at = np.column_stack(
-            [20 + RANGE * rng.uniform(-4, 4, 30), VELOCITY * rng.uniform(-9, 9, 30), towards]
-        )
-        at[:, 1] += 2 * WAVEFORM.max_velocity(1) * rng.integers(-1, 2, 30)
-        aim = Aim(rng.uniform(-0.7, 0.7, (count, 2)), np.array([0.2, 0.3])) if looks else None
-        asked = detections(at), found, WAVEFORM, 1, 10 ** rng.uniform(0, 4), aim
-        for mine, plain in zip(explain(*asked), plainly(*asked), strict=True):
-            assert mine.dtype == plain.dtype
-            assert mine.tolist() == plain.tolist()
-        explained += int((mine >= 0).sum())
-        skirts += int(explain(*asked).sidelobe.sum())
-    assert explained > 300
-    assert skirts > 50

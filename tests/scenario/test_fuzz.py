@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import copy
 import itertools
-import json
 import os
 import random
-import struct
 import warnings
 from pathlib import Path
 
@@ -231,100 +229,6 @@ def city_or_complaint(folder: Path, **keys) -> int | None:
     return city.num_faces
 
 
-QUARTER = json.loads((ROOT / "scenes/data/quarter.geojson").read_text())
-BOW = [[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]
-BOW_TIE = {
-    "type": "Feature",
-    "properties": {"height": 9},
-    "geometry": {"type": "Polygon", "coordinates": [BOW]},
-}
-CITYJSON = {
-    "type": "CityJSON",
-    "version": "2.0",
-    "transform": {"scale": [1e-3] * 3, "translate": [690_100.5, 5_334_000.25, 511.5]},
-    "CityObjects": {
-        "a": {
-            "type": "Building",
-            "attributes": {"measuredHeight": 8.0},
-            "geometry": [
-                {
-                    "type": "Solid",
-                    "lod": "2",
-                    "boundaries": [[[[0, 3, 2, 1]], [[4, 5, 6, 7]], [[0, 1, 5, 4]]]],
-                    "semantics": {"surfaces": [{"type": "RoofSurface"}], "values": [[None, 0, 0]]},
-                }
-            ],
-        }
-    },
-    "vertices": [
-        [x, y, z] for z in (0, 8200) for x, y in ((0, 0), (12400, 0), (12400, 9100), (0, 9100))
-    ],
-}
-
-
-@PROFILE
-@given(broken([QUARTER, {"type": "FeatureCollection", "features": [BOW_TIE]}, CITYJSON]))
-def test_broken_footprints(tmp_path_factory, data):
-    """GeoJSON and CityJSON with values replaced, taken away, renamed, scaled: a city of finite
-    triangles or a complaint."""
-    folder = tmp_path_factory.mktemp("f")
-    (folder / "f.geojson").write_text(json.dumps(data))
-    city_or_complaint(folder, source="footprints", file="f.geojson")
-
-
-@pytest.mark.parametrize("odd", [7, "x", None, [], {"type": "Feature", "geometry": 3}])
-def test_features_that_are_none(odd, tmp_path):
-    """Beside a good one, whose properties are a list: a city or a complaint."""
-    good = {**BOW_TIE, "properties": [1]}
-    (tmp_path / "f.geojson").write_text(
-        json.dumps({"type": "FeatureCollection", "features": [good, odd]})
-    )
-    city_or_complaint(tmp_path, source="footprints", file="f.geojson", coordinates="metres")
-
-
-def test_footprints_that_cross_themselves_or_wind_the_wrong_way(tmp_path):
-    """A bow tie keeps its two halves; clockwise rings are turned: closed buildings, outward, in
-    both cases."""
-    ring = [[0, 0], [0, 20], [30, 20], [30, 0], [0, 0]]
-    clockwise = {
-        "type": "Feature",
-        "properties": {"height": 9},
-        "geometry": {"type": "Polygon", "coordinates": [ring]},
-    }
-    for feature in (BOW_TIE, clockwise):
-        (tmp_path / "f.geojson").write_text(
-            json.dumps({"type": "FeatureCollection", "features": [feature]})
-        )
-        assert city_or_complaint(
-            tmp_path, source="footprints", file="f.geojson", coordinates="metres"
-        )
-
-
-@st.composite
-def objs(draw):
-    """Wavefront files with odd faces: quads, polygons, lines, indices out of range, numbers that
-    are none."""
-    number = st.one_of(
-        st.floats(-1e3, 1e3).map(str), st.sampled_from(["nan", "inf", "1e300", "-", "x", ""])
-    )
-    corners = [
-        f"v {draw(number)} {draw(number)} {draw(number)}" for _ in range(draw(st.integers(0, 8)))
-    ]
-    index = st.integers(-3, 12).map(str)
-    faces = [
-        "f " + " ".join(draw(st.lists(index, max_size=6))) for _ in range(draw(st.integers(0, 6)))
-    ]
-    return "\n".join(draw(st.permutations([*corners, *faces])))
-
-
-@PROFILE
-@given(objs())
-def test_odd_meshes(tmp_path_factory, text):
-    folder = tmp_path_factory.mktemp("m")
-    (folder / "m.obj").write_text(text)
-    city_or_complaint(folder, source="mesh", file="m.obj")
-
-
 def _box(suffix: str) -> bytes:
     return trimesh.creation.box(extents=(9, 7, 5)).export(file_type=suffix)
 
@@ -333,27 +237,6 @@ WHOLE = {
     suffix: data if isinstance(data := _box(suffix), bytes) else data.encode()
     for suffix in ("ply", "stl", "glb", "obj")
 }
-
-
-@PROFILE
-@given(st.sampled_from(sorted(WHOLE)), st.randoms(use_true_random=False))
-def test_truncated_and_bent_mesh_files(tmp_path_factory, suffix, chance: random.Random):
-    """Files cut off anywhere, with bytes changed. A count of 4e9 faces in a header takes neither
-    the memory nor the time."""
-    data = bytearray(WHOLE[suffix])
-    if chance.random() < 0.5:
-        data = data[: chance.randrange(len(data))]
-    for _ in range(chance.randint(0, 4)):
-        if data:
-            data[chance.randrange(len(data))] = chance.randrange(256)
-    folder = tmp_path_factory.mktemp("m")
-    (folder / f"m.{suffix}").write_bytes(bytes(data))
-    city_or_complaint(folder, source="mesh", file=f"m.{suffix}")
-
-
-def test_an_stl_that_claims_four_billion_faces(tmp_path):
-    (tmp_path / "m.stl").write_bytes(b"\0" * 80 + struct.pack("<I", 0xFFFFFFFF) + b"\0" * 50)
-    assert city_or_complaint(tmp_path, source="mesh", file="m.stl") is None
 
 
 def test_quads_become_triangles(tmp_path):
@@ -370,17 +253,6 @@ def test_quads_become_triangles(tmp_path):
     )
     for file in ("m.obj", "m.ply"):
         assert city_or_complaint(tmp_path, source="mesh", file=file) == 2
-
-
-def test_an_empty_mesh_is_refused(tmp_path):
-    header = (
-        "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float "
-        "y\nproperty float z\nelement face 0\n"
-    )
-    (tmp_path / "m.ply").write_text(header + "property list uchar int vertex_indices\nend_header\n")
-    (tmp_path / "m.obj").write_text("")
-    for file in ("m.obj", "m.ply"):
-        assert city_or_complaint(tmp_path, source="mesh", file=file) is None
 
 
 def test_a_mesh_too_large_for_memory_is_refused_before_it_is_read(tmp_path, monkeypatch):
