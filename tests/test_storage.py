@@ -6,7 +6,6 @@ import errno
 import fcntl
 import io
 import os
-import resource
 import signal
 import struct
 import subprocess
@@ -53,23 +52,6 @@ def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
     *made, temporary, renamed, folder = done
     assert made == [tmp_path.name] and renamed == "renamed" and folder == "new"
     assert temporary.startswith(".file.txt.") and (tmp_path / "new" / "file.txt").read_text() == "x"
-
-
-def test_a_disk_without_room_is_one_message_and_the_old_file_stays(tmp_path):
-    """The kernel's own limit on the size of files. Planted bug: written in place."""
-    file = tmp_path / "f"
-    write_whole(file, b"old")
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
-        with pytest.raises(StorageError, match=r"File too large; .* or make room") as caught:
-            write_whole(file, bytes(10_000))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, before)
-    assert of_machine(caught.value) and "\n" not in str(caught.value)
-    assert [p.name for p in tmp_path.iterdir()] == ["f"] and file.read_bytes() == b"old"
 
 
 KILLED = """

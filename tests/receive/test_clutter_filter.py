@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame, known
 from scipy import ndimage
 
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.payload import Payload
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.clutter_filter import occupied_factor, remove_static, runs
@@ -127,6 +130,15 @@ def test_all_cells_can_be_filtered():
         assert np.abs(spectra[m, 1, 40, sent] - (tone[sent] - tone[sent].mean())).max() < 1e-6
 
 
+@cache
+def beside_clutter(speed: float, seed: int) -> tuple[Payload, IFCube]:
+    """A target of a speed within clutter 10 dB over it, as the active terminal hears it."""
+    w, schedule, payload = frame(waveform=SHORT)
+    target = Path(2 * 24.31, 2 * speed, 1.0, (0.21, 0.1), (0.21, 0.1))
+    paths = [*clutter_paths(2, 10.0, seed, 25.0), target]
+    return payload, cube(w, schedule, payload, paths, FEW, noise=25.0, seed=seed)
+
+
 @pytest.mark.parametrize(
     ("speed", "clutter_filter", "allowed"),
     [
@@ -142,14 +154,9 @@ def test_the_filter_at_the_active_terminal(speed, clutter_filter, allowed):
     that stands still never. Without the filter it is found in some draws (the two-dimensional CFAR
     looks at other Doppler cells; the notes' map of one range row found none). -14 dB per sample of
     these short chirps (as -20 dB of the paper's); three draws."""
-    w, schedule, payload = frame(waveform=SHORT)
-    hits = 0
+    w, hits = SHORT, 0
     for seed in range(3):
-        paths = [
-            *clutter_paths(2, 10.0, seed, 25.0),
-            Path(2 * 24.31, 2 * speed, 1.0, (0.21, 0.1), (0.21, 0.1)),
-        ]
-        samples = cube(w, schedule, payload, paths, FEW, noise=25.0, seed=seed)
+        payload, samples = beside_clutter(speed, seed)
         d = receive_active(
             samples, payload, FEW, Receivers(clutter_filter=clutter_filter)
         ).detections

@@ -27,35 +27,6 @@ from isac_rt.views.interchange import write_ledger
 from isac_rt.views.report import write_report
 
 CANYON = Path(__file__).parents[2] / "scenes" / "street_canyon.yaml"
-TERMINAL_KEYS = {
-    "counts",
-    "role",
-    "ser_dpsk",
-    "ser_delay",
-    "ber",
-    "bits",
-    "bit_rate_bps",
-    "hit_rate",
-    "rmse",
-    "rmse_tracked",
-    "erased",
-    "latency_frames",
-    "matched",
-    "matched_tracked",
-    "false_per_frame",
-    "clutter_per_frame",
-    "gospa",
-    "cooperative",
-    "in_view",
-    "snr_db",
-    "tracked_rate",
-    "bounds",
-    "false_tracks_per_frame",
-    "false_tracks",
-    "losses",
-    "targets",
-}
-RMSE_KEYS = {"range_m", "velocity_mps", "azimuth_deg", "elevation_deg"}
 ROUNDING = 1e-12
 """Differences of numbers around 30 in float64, a few operations each."""
 
@@ -161,35 +132,6 @@ def test_every_variable_has_units_and_a_meaning(run, tmp_path):
             assert {"scenario", "seed", "versions", "commit", "platform"} <= set(d.attrs)
 
 
-def test_summary_has_the_fixed_keys(run):
-    s = run.summary
-    assert {
-        "scenario",
-        "seed",
-        "frames",
-        "terminals",
-        "compared",
-        "paths",
-        "timing_s",
-        "fidelity",
-        "access",
-        "sparsity",
-        "versions",
-        "links",
-        "swarm",
-    } == set(s)
-    assert set(s["terminals"]) == {"AT", "PT1"} and set(s["links"]) == {"AT->AT", "AT->PT1"}
-    for part in (*s["terminals"].values(), *s["links"].values()):
-        assert set(part) == TERMINAL_KEYS and set(part["rmse"]) == RMSE_KEYS == set(
-            part["rmse_tracked"]
-        )
-    assert set(s["timing_s"]) == {
-        *("setup", "trace", "synthesis", "receive", "track", "other", "total", "wall")
-    }
-    assert set(s["paths"]) == set(KINDS) and sum(s["paths"].values()) == 23 * 11
-    json.dumps(s, allow_nan=False)
-
-
 def test_summary_numbers_by_hand(run):
     """6 data frames to PT1, of which one lost 30 of 360, 90 of 351 and 180 of 4293. Seen to fail
     with erased symbols taken off."""
@@ -235,16 +177,6 @@ def test_failure_while_writing_leaves_the_old_file_and_no_rest(tmp_path, run, mo
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
     monkeypatch.setattr(storage, "_sync", lambda _: None)
     with pytest.raises(StorageError):
-        save(run, tmp_path / "new")
-    assert not list((tmp_path / "new").iterdir())
-
-
-def test_interrupt_while_writing_leaves_nothing(tmp_path, run, monkeypatch):
-    def stopped(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(storage.os, "replace", stopped)
-    with pytest.raises(KeyboardInterrupt):
         save(run, tmp_path / "new")
     assert not list((tmp_path / "new").iterdir())
 
