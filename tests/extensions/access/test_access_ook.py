@@ -12,7 +12,6 @@ from isac_rt.extensions.access.ook import (
     Codebook,
     Message,
     choose_run,
-    consensus,
     hot_chirps,
     hot_threshold,
     keyed,
@@ -226,40 +225,3 @@ def test_the_run_is_the_wished_one_or_the_nearest_free():
     assert choose_run(taken, 3, 3) == 1
     assert choose_run(taken, 3, 18) == 14
     assert choose_run(np.arange(19) % 3 == 2, 3) is None
-
-
-def test_the_majority_of_blocks_is_believed():
-    """Planted bug: the first of a tie taken."""
-    a, b = (3, Message(1, 3)), (4, Message(1, 3))
-    assert consensus([a, b, a]) == a
-    assert consensus([a, b]) is None
-    assert consensus([]) is None
-
-
-def test_taken_blocks_are_missed_and_free_ones_suspected_as_the_binomial_says():
-    """Share of blocks of 12 chirps called free with a sender in them, and taken without one, at a
-    false rate of 2 % and a cell SNR of 2.
-
-    Planted bug: the threshold for a single cell."""
-    rng, num_cells, rx, chirps, trials = np.random.default_rng(6), 64, 2, 12, 1500
-    needed, g = needed_chirps(chirps, 0.02), 2.0
-    t = hot_threshold(rx, num_cells)
-    off, on = (
-        stats.f(2 * rx, 2 * rx * (num_cells - 1)),
-        stats.ncf(2 * rx, 2 * rx * (num_cells - 1), 2 * rx * g),
-    )
-    one = 1 - on.cdf(t) * off.cdf(t) ** (num_cells - 1)
-    samples = noise(rng, 2, rx, chirps * trials, num_cells)
-    cells = rng.integers(0, num_cells, chirps * trials)
-    sent = np.exp(2j * np.pi * cells[:, None] * np.arange(num_cells) / num_cells)
-    samples[1] += (np.sqrt(g / num_cells) * sent).astype(np.complex64)
-    blocks = [hot_chirps(samples[:, :, i * chirps : (i + 1) * chirps]) for i in range(trials)]
-    taken = (np.array(blocks) >= needed).sum(axis=0)
-    missed, false = (
-        stats.binom.cdf(needed - 1, chirps, one),
-        stats.binom.sf(needed - 1, chirps, HOT_RATE),
-    )
-    print("missed", 1 - taken[1] / trials, missed, "false", taken[0] / trials, false)
-    assert 0.05 < missed < 0.95
-    assert within(trials - taken[1], trials, missed)
-    assert within(taken[0], trials, false)
