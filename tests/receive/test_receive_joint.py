@@ -15,10 +15,11 @@ from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.arms import element_delays
-from isac_rt.receive.joint.fit import _Descent, energy, fit, places
+from isac_rt.receive.joint.fit import Fit, _Descent, energy, fit, places, residual_channels
 from isac_rt.receive.joint.interaction import IGNORED, TANGENTS, clusters, ignored, shared
 from isac_rt.receive.joint.moments import Moments, _weights
 from isac_rt.receive.joint.neighbours import (
+    _beams,
     _earlier_reference,
     _hidden,
     _widened,
@@ -153,6 +154,54 @@ def test_a_path_against_its_own_template_has_no_slope():
     zeroth, first = moments.of(Tones.of(sent, [path])[0], Weights.by_chirp(sent))[0, :, 0]
     assert np.abs(zeroth) == pytest.approx(np.abs(zeroth).mean(), rel=1e-3)
     assert np.abs(first).max() < 1e-3 * np.abs(zeroth).mean() * w.num_samples
+
+
+@pytest.mark.parametrize("passes", [2, 1])
+def test_energy_of_a_path_in_the_residual(passes: int):
+    """What a fit leaves holds a second path whole in its own direction and Doppler bin, |b|^2 times
+    all samples, and in noise a beam holds its power, as a sum over the antennas whose departure is
+    free. Planted bugs: Doppler turned the other way; the share of one array; the root of the
+    samples left out."""
+    w, schedule, payload = frame(waveform=SHORT)
+    first = np.array([17.3147, 1.7, 0.31, -0.22, 0.7, 1.0, 0.0, 0.0])
+    second = first + np.array([0, 1.5 * w.velocity_cell(passes), -0.5, 0.43, 0, -0.97, 0, 0])
+    b, direction = second[5], second[2:4]
+    clean = sum(
+        samples(w, schedule, payload, FEW, t[:6] if passes == 2 else t, passes)
+        for t in (first, second)
+    )
+    count = FEW.num_tx if passes == 1 else 1
+    path = JointPath(
+        passes * first[0] / C,
+        passes * first[1] / C,
+        first[2:4],
+        np.full(count, np.exp(0.7j)),
+        np.zeros(4),
+    )
+    offsets = np.array([-1.5, 0.0, 1.5])
+
+    def beams(cube: IFCube) -> tuple[np.ndarray, np.ndarray]:
+        sent = known(w, schedule, payload, FEW, passes)
+        moments = Moments(cube.samples, sent)
+        ((channels, counts),) = residual_channels(moments, Fit([path], 1.0), [path], offsets)
+        grid = np.array([direction, -direction, [0.1, 0.3]])
+        return _beams(sent, path, channels, grid), counts
+
+    quiet = IFCube(
+        samples=clean.astype(np.complex64), waveform=w, schedule=schedule, start_time=0.0
+    )
+    power, counts = beams(quiet)
+    total = clean.size * b**2
+    assert counts.sum() == clean.size
+    assert np.unravel_index(power.argmax(), power.shape) == (0, 2)
+    # the rate's beat slips by 1.5 N T_s / T_frame of a cell over a chirp, the migration is less
+    assert power[0, 2] == pytest.approx(total, rel=0.02)
+    own = samples(w, schedule, payload, FEW, first[:6] if passes == 2 else first, passes)
+    mean = np.mean([beams(noisy(w, schedule, own, 1.0, seed))[0].mean() for seed in range(30)])
+    sums = 1 if passes == 2 else FEW.num_tx
+    assert mean == pytest.approx(
+        sums, rel=5 / np.sqrt(30 * 3 * sums)
+    )  # statistical: of beams and bins alike three are apart
 
 
 def predicted(theta: np.ndarray, w: Waveform) -> Prediction:
