@@ -256,14 +256,14 @@ def over_noise(setup: Setup, link: Link, frame: int, *, whole: bool) -> tuple[np
     return power, seen.length, resolution_cell(setup.waveform, *motion)
 
 
-def test_noise_and_clutter_keep_their_power(error=1.0):
+def test_noise_and_clutter_keep_their_power():
     """Seven draws of the places, both links, three frames. Nine of ten range-Doppler cells keep
     noise plus mean clutter to the error asked for, against all scatterers. In range cells of 4 m of
     path noise plus clutter over noise plus dense clutter is that of a field six times as
     dense: no link and frame is apart by more than the draws explain (Student's t at 1e-4). Planted
     bugs: merged cells keep the area of one half; what the transmitter sees counts as seen by
     both."""
-    edges = np.arange(0.0, 300.0, 4.0)
+    error, edges = 1.0, np.arange(0.0, 300.0, 4.0)
     dense = prepared(
         seed=99, clutter={"max_error_db": error / 4}, accuracy={"preset": "everything"}
     )

@@ -172,13 +172,13 @@ PLACES = np.array([[0, 0, 30], [-6, 14, 28], [9, 11, 33], [2, 22, 31]], float)
 """Of one active and three passive terminals, each moved by up to 4 m [m]."""
 
 
-def swarm(seed: int, moving: bool, snr_db: float) -> Network:
-    """Stages of random swarms and clocks on lines of sight of unit gain, at rest or on curved
-    flights of some 6 m/s and 3 m/s^2."""
+def swarm(seed: int, snr_db: float) -> Network:
+    """Stages of random swarms and clocks on lines of sight of unit gain, on curved flights of
+    some 6 m/s and 3 m/s^2."""
     w, rng = Waveform(num_samples=256, num_chirps=60), np.random.default_rng(seed)
     names = ("A", "P", "Q", "R")
     x = PLACES + rng.uniform(-4, 4, (4, 3))
-    v, a = moving * rng.normal(size=(2, 4, 3)) * np.array([[[4.0]], [[2.0]]])
+    v, a = rng.normal(size=(2, 4, 3)) * np.array([[[4.0]], [[2.0]]])
 
     def scene(time, links):
         poses = {
@@ -222,15 +222,14 @@ def swarm(seed: int, moving: bool, snr_db: float) -> Network:
     )
 
 
-@pytest.mark.parametrize("moving", [False, True])
-def test_clocks_are_as_sure_as_stated(moving: bool):
-    """60 links of 20 drawn swarms at -12 to 30 dB per sample, two rounds on the exact signal: RMS
-    of errors over their stated deviations is 0.8 to 1.25 (chi-square: 0.91 to 1.09 at one sigma) of
+def test_clocks_are_as_sure_as_stated():
+    """120 links of 40 drawn swarms at -12 to 30 dB per sample, two rounds on the exact signal: RMS
+    of errors over their stated deviations is 0.8 to 1.25 (chi-square: 0.94 to 1.06 at one sigma) of
     offset and of drift. Planted bugs: the floors of a path among others; the path's acceleration
     left out."""
     errors = []
-    for seed in range(20):
-        n = swarm(seed, moving, (-12, 2, 16, 30)[seed % 4])
+    for seed in range(40):
+        n = swarm(seed, (-12, 2, 16, 30)[seed % 4])
         for (at, pt), link in establish(n).links.items():
             assert link.clock is not None
             one, other, got = n.clocks[at], n.clocks[pt], link.clock
@@ -239,7 +238,7 @@ def test_clocks_are_as_sure_as_stated(moving: bool):
             errors.append([offset / got.offset_std, drift / got.drift_std])
     ratio = np.sqrt(np.mean(np.square(errors), axis=0))
     print(ratio)
-    assert len(errors) == 60
+    assert len(errors) == 120
     assert (ratio > 0.8).all() and (ratio < 1.25).all()
 
 
