@@ -599,7 +599,7 @@ OF_TESTS = (
         Bug("simulation/preflight.py", "if free is not None and needed > free:", "if False:"),
     ),
     (
-        "test_fuzz::test_units_wrong_by_a_thousand_are_warned_of",
+        "test_scenario::test_units_wrong_by_a_thousand_are_doubted",
         Bug("scenario/doubts.py", '(1e9, 1e12, "hertz")', '(1e3, 1e15, "hertz")'),
     ),
     (

@@ -18,13 +18,12 @@ from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.legs.clearance import CLEARANCE, ClearanceWarning
 from isac_rt.propagation.legs.geometry import unfold
 from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.scenario.file import load, to_yaml
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.methods import Auto
 from isac_rt.simulation.preflight import check_flights, warn_of_aliases
 from isac_rt.simulation.setup import prepare, swarm_of, timetable_of
 from isac_rt.world.city import CityMesh, load_city
-from isac_rt.world.city.materials import CityError, MaterialUse
+from isac_rt.world.city.materials import MaterialUse
 from isac_rt.world.city.mesh import Surface, clean
 
 C = 299_792_458.0
@@ -454,28 +453,3 @@ def test_far_from_the_origin(far):
         lengths.append(C * np.sort(paths.delay))
     assert lengths[0].size > 3
     assert lengths[1] == pytest.approx(lengths[0], abs=30 * np.spacing(far))
-
-
-def test_a_scenario_beyond_1e5_m_warns(tmp_path):
-    file = tmp_path / "far.yaml"
-    file.write_text(to_yaml(flight(A=((0, 0, 9), (0, 0, 0)), U=((0, 2e5, 9), (0, 0, 0)))))
-    with pytest.warns(ScenarioWarning, match="is it in metres"):
-        load(file)
-
-
-def test_a_mesh_without_area_or_with_nan_is_refused():
-    with pytest.raises(CityError, match="no face with an area"):
-        clean(
-            [Surface(np.zeros((3, 3)), np.array([[0, 1, 2]]), MaterialUse("concrete"))],
-            "m.ply",
-            np.zeros(3),
-            None,
-        )
-    bad = np.array([[0, 0, 0], [1, np.nan, 0], [0, 1, 0]])
-    with pytest.raises(CityError, match="NaN or infinite"):
-        clean(
-            [Surface(bad, np.array([[0, 1, 2]]), MaterialUse("concrete"))],
-            "m.ply",
-            np.zeros(3),
-            None,
-        )

@@ -322,32 +322,6 @@ def test_what_cannot_run_is_refused_before_it_starts(changes, words, tmp_path, c
     assert not list(tmp_path.glob("o/*"))
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"radio": {"carrier_hz": 770e6}},
-        {"radio": {"carrier_hz": 77e12}},
-        {
-            "swarm": {
-                "A": {"role": "active", "position_m": [0, 0, 9000.0]},
-                "U": {"role": "target", "position_m": [1e6, 9000, 9000]},
-            }
-        },
-        {"swarm": {"A": {"role": "active", "position_m": [0, 0, 9], "velocity_mps": [0, 9300, 0]}}},
-        {"noise": {"tx_power_dbm": 120.0}},
-        {"noise": {"noise_figure_db": 120.0}},
-        {"frame_interval_s": 45.0},
-    ],
-    ids=lambda c: next(iter(c)),
-)
-def test_units_wrong_by_a_thousand_are_warned_of(changes, tmp_path):
-    """Written against: no check of the key."""
-    file = tmp_path / "s.yaml"
-    file.write_text(scenario_text(**changes))
-    with pytest.warns(ScenarioWarning, match=r"is it in|more than|outside"):
-        load(file)
-
-
 def test_files_outside_the_scenarios_folder_only_where_they_are_named(tmp_path):
     """A mesh elsewhere is read where the scenario names it; a scene file of somebody else cannot
     reach out of its own folder."""

@@ -430,6 +430,10 @@ def test_numbers_as_in_yaml_1_2(tmp_path, written, value):
     ("option", "said"),
     [
         ("radio.carrier_hz=9e8", "is it in hertz"),
+        ("radio.carrier_hz=77e12", "is it in hertz"),
+        ("noise.tx_power_dbm=120", "is it in dBm"),
+        ("noise.noise_figure_db=120", "is it in"),
+        ("frame_interval_s=45", "is it in seconds"),
         ("swarm.PT1.velocity_mps=[0, 1500, 0]", "is it in metres and seconds"),
         ("swarm.PT1.position_m=[0, 2e5, 0]", "is it in metres"),
     ],

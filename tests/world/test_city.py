@@ -300,6 +300,8 @@ def test_bad_faces_are_removed_and_counted():
         )
     with pytest.raises(CityError, match="names vertex 7"):
         clean([Surface(vertices, faces[:1] + 5, MaterialUse("metal"))], "x", np.zeros(3), None)
+    with pytest.raises(CityError, match="no face with an area"):
+        clean([Surface(vertices, faces[2:4], MaterialUse("metal"))], "x", np.zeros(3), None)
 
 
 def by_plane_and_sides(corners, point):
