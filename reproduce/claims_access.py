@@ -208,7 +208,8 @@ def streams(quick: bool, seed: int, report: Progress) -> tuple[pd.DataFrame, tup
         report(k + 1, frames)
     rows, texts = [], []
     for (name, snr), n in counts.items():
-        rate, groups = n.bits_total / n.frames / w.frame_duration / 1e3, users[name][0]
+        groups = users[name][0]
+        rate = w.of_groups(groups).bits_per_frame(8) / w.frame_duration / 1e3
         bits = n.bit_errors, n.bits_total
         rows.append((name, " ".join(map(str, groups)), snr, rate, *_counts(n), *bits))
         texts.append((name, f"{snr:g} dB: {_rates(n)}"))

@@ -1,16 +1,25 @@
-"""Bits to delay symbols and DPSK symbols and back, per group and chirp."""
+"""Bits to delay symbols and DPSK symbols and back, per group and chirp, and their check sum.
+
+The last 8 bits of a frame are the remainder of the others, times D^8, by the polynomial gCRC8(D) =
+D^8 + D^7 + D^4 + D^3 + D + 1 of 3GPP TS 36.212, section 5.1.1. A receiver divides all of them: the
+remainder is zero, and of other bits in one frame of 256. Where terminals read some of the groups
+alone, each set of groups that the same terminals read has a check sum of its own.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
 from isac_rt.frame.schedule import Schedule
-from isac_rt.frame.waveform import Waveform
+from isac_rt.frame.waveform import CHECK_BITS, Waveform
 
 MODULATION_ORDERS = (2, 4, 8, 16)
+CHECK_POLYNOMIAL = 0b1_1001_1011
+"""gCRC8, the highest power first."""
 
 
 @dataclass(frozen=True)
@@ -19,13 +28,15 @@ class Payload:
 
     Attributes
     ----------
-    bits : (bits_per_frame,) uint8; the delay bits first, (group, chirp)-major, then the DPSK bits
-        in the order (group, antenna, transition); empty when the frame is unmodulated
+    bits : (bits_per_frame,) uint8, check sums included; the delay bits first, (group, chirp)-major,
+        then the DPSK bits in the order (group, antenna, transition); empty when the frame is
+        unmodulated
     delay_symbols : (M, P) int in [0, N/2)
     transitions : (M, L_tx, P/L_tx - 1) int in [0, D): the independent DPSK symbols
     phases : (M, P) complex128, beta^(D) of every chirp: the running product of its antenna's
         transitions
     num_delay_bits : how many of the bits are on the delay symbols
+    check : (C,) places of the check sums among the bits
     """
 
     bits: np.ndarray
@@ -33,6 +44,7 @@ class Payload:
     transitions: np.ndarray
     phases: np.ndarray
     num_delay_bits: int = 0
+    check: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
         for a in (self.bits, self.delay_symbols, self.transitions, self.phases):
@@ -45,9 +57,16 @@ class Payload:
     def bits_of(self, groups: Sequence[int]) -> np.ndarray:
         """The bits that some groups carry, in the order of `bits` with the other groups left
         out."""
+        return self._of(groups, self.bits)
+
+    def is_check(self, groups: Sequence[int]) -> np.ndarray:
+        """Mark the check sums among `bits_of` groups."""
+        return self._of(groups, np.isin(np.arange(self.bits.size), self.check))
+
+    def _of(self, groups: Sequence[int], values: np.ndarray) -> np.ndarray:
         if not self.modulated:
-            return self.bits
-        parts = np.split(self.bits, [self.num_delay_bits])
+            return values
+        parts = np.split(values, [self.num_delay_bits])
         return np.concatenate(
             [part.reshape(len(self.delay_symbols), -1)[list(groups)].ravel() for part in parts]
         )
@@ -68,13 +87,53 @@ def unmodulated(waveform: Waveform) -> Payload:
 def random_payload(
     waveform: Waveform, schedule: Schedule, dpsk_order: int, rng: np.random.Generator
 ) -> Payload:
-    """Independent fair bits, modulated."""
-    return modulate(
-        rng.integers(0, 2, waveform.bits_per_frame(dpsk_order), dtype=np.uint8),
-        waveform,
-        schedule,
-        dpsk_order,
-    )
+    """Independent fair bits with their check sums, modulated."""
+    bits = rng.integers(0, 2, waveform.bits_per_frame(dpsk_order), dtype=np.uint8)
+    return modulate(with_check_sums(bits, waveform, dpsk_order), waveform, schedule, dpsk_order)
+
+
+def with_check_sums(bits: np.ndarray, waveform: Waveform, dpsk_order: int) -> np.ndarray:
+    """Return a frame's bits with the last 8 of each checked set of groups made their check sum."""
+    bits = bits.copy()
+    for places in _checked(waveform, dpsk_order):
+        data, check = np.split(places, [-CHECK_BITS])
+        padded = np.append(bits[data], np.zeros(CHECK_BITS, np.uint8))
+        bits[check] = _unpack(np.array([remainder(padded)]), CHECK_BITS)
+    return bits
+
+
+def passes_check(bits: np.ndarray, waveform: Waveform, dpsk_order: int) -> bool:
+    """Return whether the check sums among a frame's bits hold; True of bits without any."""
+    return not any(remainder(bits[places]) for places in _checked(waveform, dpsk_order))
+
+
+def remainder(bits: np.ndarray) -> int:
+    """Remainder of bits, the highest power first, divided by the check sum's polynomial."""
+    return int(np.bitwise_xor.reduce(_powers(bits.size)[bits > 0]))
+
+
+@lru_cache(maxsize=64)
+def _powers(count: int) -> np.ndarray:
+    """Remainders of D^(count - 1) .. D^0."""
+    out, power = np.empty(count, np.int64), 1
+    for i in range(count):
+        out[count - 1 - i] = power
+        power <<= 1
+        if power >> CHECK_BITS:
+            power ^= CHECK_POLYNOMIAL
+    return out
+
+
+@lru_cache(maxsize=64)
+def _checked(waveform: Waveform, dpsk_order: int) -> list[np.ndarray]:
+    """Places of each checked set of groups among the bits of a frame, in their order."""
+    split = waveform.num_groups * waveform.num_chirps * waveform.bits_per_delay_symbol
+    parts = np.split(np.arange(waveform.bits_per_frame(dpsk_order)), [split])
+    by_group = [part.reshape(waveform.num_groups, -1) for part in parts]
+    return [
+        np.concatenate([part[list(groups)].ravel() for part in by_group])
+        for groups in waveform.check_sums(dpsk_order)
+    ]
 
 
 def modulate(bits: np.ndarray, waveform: Waveform, schedule: Schedule, dpsk_order: int) -> Payload:
@@ -97,9 +156,10 @@ def modulate(bits: np.ndarray, waveform: Waveform, schedule: Schedule, dpsk_orde
     transitions = _gray_decode(_pack(bits[split:], dpsk_order.bit_length() - 1)).reshape(
         w.num_groups, w.num_tx, w.num_chirps // w.num_tx - 1
     )
-    return Payload(
-        bits.copy(), delay, transitions, running_phases(transitions, schedule, dpsk_order), split
-    )
+    phases = running_phases(transitions, schedule, dpsk_order)
+    sums = [places[-CHECK_BITS:] for places in _checked(w, dpsk_order)]
+    check = np.concatenate([np.zeros(0, np.int64), *sums])
+    return Payload(bits.copy(), delay, transitions, phases, split, check)
 
 
 def demodulate_bits(

@@ -3,7 +3,7 @@ I)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -15,6 +15,7 @@ from isac_rt.frame.settings import (
     SKIRT_SHARE,
     Array,
     ChirpTimes,
+    Modulation,
     Radio,
     chirp_times,
     num_resource_blocks,
@@ -22,6 +23,8 @@ from isac_rt.frame.settings import (
 
 SPEED_OF_LIGHT = 299_792_458.0
 BOLTZMANN = 1.380649e-23
+CHECK_BITS = 8
+"""Bits of a check sum."""
 
 
 Scheme = Literal["tdm", "ddm", "bpm"]
@@ -67,6 +70,7 @@ class Waveform:
     scheme : how antennas share the chirps: "tdm", one in each group and slot; "ddm" and "bpm", all
         at once, by codes (`isac_rt.frame.schedule.codes_of`)
     bands : Doppler bands, or length of the codes, of antennas that send at once; 1: they do not
+    checked : sets of groups whose bits end with one check sum; None: one for all groups
 
     Examples
     --------
@@ -88,6 +92,7 @@ class Waveform:
     carries_data: bool = True
     scheme: Scheme = "tdm"
     bands: int = 1
+    checked: tuple[tuple[int, ...], ...] | None = None
 
     def __post_init__(self) -> None:
         if self.sweep is None and self.bandwidth <= 2 * self.sampling_rate:
@@ -223,6 +228,20 @@ class Waveform:
             + (self.num_chirps - self.num_tx) * (dpsk_order.bit_length() - 1)
         )
 
+    @property
+    def _checked(self) -> tuple[tuple[int, ...], ...]:
+        return (tuple(range(self.num_groups)),) if self.checked is None else self.checked
+
+    def check_sums(self, dpsk_order: int) -> list[tuple[int, ...]]:
+        """Return the groups of each check sum; those with no bit besides have none."""
+        each = self.bits_per_frame(dpsk_order) // self.num_groups
+        return [groups for groups in self._checked if len(groups) * each > CHECK_BITS]
+
+    def payload_bits(self, dpsk_order: int) -> int:
+        """Bits of a frame that are left beside its check sums."""
+        sums = len(self.check_sums(dpsk_order))
+        return self.bits_per_frame(dpsk_order) - CHECK_BITS * sums
+
     def range_cell(self, passes: int) -> float:
         """Range of one cell [m]: c T~ / (B T) for one pass (PT), half of it for an echo (passes =
         2, AT)."""
@@ -245,8 +264,10 @@ class Waveform:
 
     def of_groups(self, groups: Sequence[int]) -> Waveform:
         """The same frame seen by a receiver that reads only these groups."""
-        blocks = self.blocks or tuple(range(self.num_groups))
-        return replace(self, num_groups=len(groups), blocks=tuple(blocks[m] for m in groups))
+        blocks, place = self.blocks or tuple(range(self.num_groups)), list(groups).index
+        whole = tuple(tuple(map(place, one)) for one in self._checked if set(one) <= set(groups))
+        blocks = tuple(blocks[m] for m in groups)
+        return replace(self, num_groups=len(groups), blocks=blocks, checked=whole)
 
     @cached_property
     def chirp_time(self) -> np.ndarray:
@@ -322,8 +343,20 @@ class Waveform:
         return (self.slope * tau + delay_rate * self.carrier(tau)) * self.sampled_duration
 
 
-def waveform_of(r: Radio, a: Array) -> Waveform:
-    """The waveform that a scenario's radio and array state."""
+def read_together(
+    streams: Mapping[str, Sequence[int]], num_groups: int
+) -> tuple[tuple[int, ...], ...]:
+    """Return the groups in sets that the same terminals read, by the `streams` of some terminals;
+    the others read all."""
+    readers: dict[tuple[str, ...], list[int]] = {}
+    for m in range(num_groups):
+        names = tuple(name for name, groups in streams.items() if m in groups)
+        readers.setdefault(names, []).append(m)
+    return tuple(map(tuple, readers.values()))
+
+
+def waveform_of(r: Radio, a: Array, modulation: Modulation | None = None) -> Waveform:
+    """The waveform that a scenario's radio and array state, and its check sums."""
     num_tx, sweep, scheme = a.num_tx, None, r.scheme
     if r.chirp is not None:
         slope, start = r.chirp.slope_mhz_per_us * 1e12, r.chirp.adc_start_us * 1e-6
@@ -341,6 +374,7 @@ def waveform_of(r: Radio, a: Array) -> Waveform:
         carries_data=r.mode == "isac",
         scheme=scheme if r.bands(num_tx) > 1 and scheme != "simo" else "tdm",
         bands=r.bands(num_tx),
+        checked=None if modulation is None else read_together(modulation.streams, r.groups),
     )
 
 

@@ -21,6 +21,7 @@ from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import cleaned
 from isac_rt.receive.symbols import (
     ByPowers,
+    CarrierPhases,
     Symbols,
     confidence_threshold,
     decide_phases,
@@ -108,10 +109,8 @@ class PassiveReceiver:
             )
             detections, reference = self._alone(moments, detections, reference)
             return self._reception(cube, moments, found, detections, reference, maps=maps)
-        symbols = None
-        if prediction is not None:
-            symbols = self.reader.read(cube, prediction, self.antennas)
-        if prediction is None or symbols is None or not self._believed(symbols, w):
+        symbols = None if prediction is None else self._read(cube, prediction)
+        if prediction is None or symbols is None:
             power = np.zeros((w.num_range_cells, w.num_chirps))
             kept_maps = make_maps(power, cube, self.settings, 1) if maps else None
             return Reception.undecoded(w, no_detections(), kept_maps)
@@ -119,24 +118,24 @@ class PassiveReceiver:
         spectra, known = cleaned(cube, read)
         moments = Moments(cube.samples, known)
         found, detections, reference = self._sense_data(spectra, moments, prediction, hints)
-        phases = None
+        decided = None
         if self.refiner is not None and reference is not None:
-            phases = self._phases(moments, detections)
-        if phases is not None:
-            turn = phases.conj() * known.phases
+            decided = self._phases(moments, detections)
+        if decided is not None:
+            turn = decided.phases.conj() * known.phases
             if np.abs(turn - 1).max() > SAME_PHASE:
                 spectra = spectra * turn.astype(np.complex64)[:, None, None]
-                moments = moments.read_by(replace(known, phases=phases))
+                moments = moments.read_by(replace(known, phases=decided.phases))
                 found, detections, reference = self._sense_data(spectra, moments, prediction, hints)
         else:
             spread = velocity_spread(symbols, self.reader.order, prediction, w)
             detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))
         chain = self
         wrong = transition_error_rate(symbols, self.reader.order) * symbols.transitions.size
-        if phases is None and wrong > MOST_WRONG:
+        if decided is None and wrong > MOST_WRONG:
             chain = replace(self, refiner=None)
         reception = chain._reception(cube, moments, found, detections, reference, maps=maps)
-        return reception if reference is None else _decoded(reception, symbols)
+        return reception if reference is None else self._decoded(reception, symbols, w)
 
     def receive_over(
         self,
@@ -153,8 +152,8 @@ class PassiveReceiver:
             mine = every.receive_over(part, path, hints, maps=maps)
             return _among_all(mine, self.groups, cube.waveform)
         w = cube.waveform
-        symbols = self.reader.read(cube, path, self.antennas)
-        if not self._believed(symbols, w):
+        symbols = self._read(cube, path)
+        if symbols is None:
             return Reception.undecoded(w, no_detections())
         read = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
         spectra, known = cleaned(cube, read)
@@ -164,21 +163,60 @@ class PassiveReceiver:
         spread = velocity_spread(symbols, self.reader.order, path, w)
         detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))
         reception = self._reception(cube, moments, found, detections, reference, maps=maps)
-        return _decoded(reception, symbols)
+        return self._decoded(reception, symbols, w)
 
     def of_symbols(self, symbols: Symbols, read: Waveform, waveform: Waveform) -> Reception | None:
         """Return the reception of symbols that were read by a waveform of this receiver's groups;
         None where they are not believed."""
         if not self._believed(symbols, read):
             return None
-        out = _decoded(Reception.undecoded(read, no_detections()), symbols)
+        out = self._decoded(Reception.undecoded(read, no_detections()), symbols, read)
         return out if self.groups is None else _among_all(out, self.groups, waveform)
 
-    def _phases(self, moments: Moments, detections: Detections) -> np.ndarray | None:
-        """The phases as the reference, row 0 of the detections, shows them over the whole frame."""
-        if not np.isfinite(detections.direction[0]).all():
+    def _read(self, cube: IFCube, prediction: Prediction) -> Symbols | None:
+        """Decide the symbols by all predicted paths and, where these are not believed or fail the
+        check, by the reference alone; None: neither is believed."""
+        failed = None
+        for paths in (prediction, prediction.reference)[: prediction.range.size]:
+            symbols = self.reader.read(cube, paths, self.antennas)
+            if self._believed(symbols, cube.waveform):
+                symbols = self._decided_again(cube, symbols, paths)
+                if symbols.is_intact(cube.waveform, self.reader.order):
+                    return symbols
+                failed = failed or symbols
+        return failed
+
+    def _decided_again(self, cube: IFCube, symbols: Symbols, path: Prediction) -> Symbols:
+        """Decide the phases once more, against one carrier over the frame, where the check sum of
+        those decided from chirp to chirp fails; kept if it holds then."""
+        w, order = cube.waveform, self.reader.order
+        if symbols.is_intact(w, order):
+            return symbols
+        known = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
+        decided = self._phases(Moments(cube.samples, known), path)
+        return symbols.with_phases(decided, known, order)
+
+    def _decoded(self, reception: Reception, symbols: Symbols, waveform: Waveform) -> Reception:
+        """A reception with the symbols that were read."""
+        return replace(
+            reception,
+            decoded=True,
+            intact=symbols.is_intact(waveform, self.reader.order),
+            delay_symbols=symbols.delay,
+            transitions=symbols.transitions,
+            bits=symbols.bits,
+            delay_confidence=symbols.delay_confidence,
+            transition_confidence=symbols.transition_confidence,
+            raw_delay_symbols=symbols.raw,
+            soft_bits=symbols.soft_bits,
+            confidence_looks=symbols.looks,
+        )
+
+    def _phases(self, moments: Moments, paths: Detections | Prediction) -> CarrierPhases | None:
+        """The phases as the reference, row 0 of the paths, shows them over the whole frame."""
+        if not np.isfinite(paths.direction[0]).all():
             return None
-        first = detections
+        first = paths
         delay, rate = first.range[0] / SPEED_OF_LIGHT, first.velocity[0] / SPEED_OF_LIGHT
         path = JointPath(delay, rate, first.direction[0], np.ones(1), np.zeros(4))
         return decide_phases(moments, path, self.reader.order)
@@ -359,22 +397,6 @@ def receive_passive(
     """
     chain = PassiveReceiver.of(antennas, settings, dpsk_order, groups)
     return chain.receive(cube, prediction, modulated, maps=maps)
-
-
-def _decoded(reception: Reception, symbols: Symbols) -> Reception:
-    """A reception with the symbols that were read."""
-    return replace(
-        reception,
-        decoded=True,
-        delay_symbols=symbols.delay,
-        transitions=symbols.transitions,
-        bits=symbols.bits,
-        delay_confidence=symbols.delay_confidence,
-        transition_confidence=symbols.transition_confidence,
-        raw_delay_symbols=symbols.raw,
-        soft_bits=symbols.soft_bits,
-        confidence_looks=symbols.looks,
-    )
 
 
 def _off(detections: Detections, paths: Detections, known: Known) -> np.ndarray:

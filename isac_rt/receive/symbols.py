@@ -25,7 +25,7 @@ from scipy import special
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
-from isac_rt.frame.payload import by_antenna, demodulate_bits, running_phases
+from isac_rt.frame.payload import by_antenna, demodulate_bits, passes_check, running_phases
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.vector import new_memory
 from isac_rt.receive.clutter_filter import runs
@@ -101,6 +101,28 @@ class Symbols:
     soft_bits: np.ndarray = field(default_factory=lambda: np.zeros(0))
     least_spread: float | None = None
     gathering: Gathering | None = None
+
+    def is_intact(self, waveform: Waveform, order: int) -> bool:
+        """Return whether the check sums among the bits hold."""
+        return passes_check(self.bits, waveform, order)
+
+    def with_phases(self, decided: CarrierPhases | None, known: Known, order: int) -> Symbols:
+        """Return the same delay symbols with phases that were decided once more, if the check sums
+        hold then; else these."""
+        for phases in () if decided is None else (decided.phases, decided.second):
+            chains = by_antenna(phases, known.schedule, known.waveform.num_tx)
+            turns = np.angle(chains[..., 1:] * chains[..., :-1].conj())
+            transitions = np.round(turns * order / (2 * np.pi)).astype(np.int64) % order
+            again = replace(
+                self,
+                transitions=transitions,
+                phases=running_phases(transitions, known.schedule, order),
+                bits=demodulate_bits(self.delay, transitions, known.waveform, order),
+                soft_bits=np.zeros(0),
+            )
+            if again.is_intact(known.waveform, order):
+                return again
+        return self
 
 
 @lru_cache(maxsize=64)
@@ -362,8 +384,17 @@ FALSE_RATE = 1e-3
 ROUNDS = 2
 
 
-def decide_phases(moments: Moments, path: JointPath, order: int) -> np.ndarray | None:
-    """(M, P) running phases of a modulated frame at a PT; None where it shows no carrier.
+class CarrierPhases(NamedTuple):
+    """Running phases (M, P) decided against one carrier over a frame, the velocity's error [bins]
+    that they show, and the phases with the least sure chirp at its second choice."""
+
+    phases: np.ndarray
+    offset: float
+    second: np.ndarray
+
+
+def decide_phases(moments: Moments, path: JointPath, order: int) -> CarrierPhases | None:
+    """Return the running phases of a modulated frame at a PT; None where it shows no carrier.
 
     Hard decisions add up nearly in phase whatever the carrier and the velocity: of uniform phases
     they leave sin(pi/D)/(pi/D) of the sum, 0.994 for D = 16. So it is no evidence that the decided
@@ -377,26 +408,26 @@ def decide_phases(moments: Moments, path: JointPath, order: int) -> np.ndarray |
 
     Returns
     -------
-    phases : as sent, but for whole steps that an antenna has in common over the frame: those belong
-        to its amplitude
+    CarrierPhases; phases are as sent but for whole steps that an antenna has in common over the
+    frame: those belong to its amplitude
     """
-    known, phases = moments.known, None
+    known, decided = moments.known, None
     for _ in range(ROUNDS):
         path = fit(moments, [path]).paths[0]
         matched = match_chirps(moments, path)
-        found = _decide(known, matched * known.phases, order)
+        found = decide_by_carrier(known, matched * known.phases, order)
         if found is None:
             break
-        phases, offset = found
-        path = replace(path, delay_rate=path.delay_rate + offset * rate_bin(known.waveform))
-        known = replace(known, phases=phases)
+        decided = found
+        rate = path.delay_rate + found.offset * rate_bin(known.waveform)
+        path = replace(path, delay_rate=rate)
+        known = replace(known, phases=found.phases)
         moments = moments.read_by(known)
-    return phases
+    return decided
 
 
-def _decide(known: Known, chirps: np.ndarray, order: int) -> tuple[np.ndarray, float] | None:
-    """Phases of the chirps' sums (M, P), and the velocity's error [bins] that they show; None where
-    noise alone would show as much."""
+def decide_by_carrier(known: Known, chirps: np.ndarray, order: int) -> CarrierPhases | None:
+    """Return the phases of the chirps' sums (M, P); None where noise alone would show as much."""
     w = known.waveform
     far = min(FARTHEST, UNAMBIGUOUS * w.num_chirps / order)
     offsets = np.linspace(-far, far, 2 * int(np.ceil(far * order / STEP)) + 1)
@@ -414,10 +445,14 @@ def _decide(known: Known, chirps: np.ndarray, order: int) -> tuple[np.ndarray, f
     if line[best] < special.gammainccinv(w.num_tx, FALSE_RATE / offsets.size):
         return None
     carrier = np.angle(sums[:, best])[known.schedule] / order
-    steps = np.round(
-        (np.angle(chirps) - 2 * np.pi * offsets[best] * turns - carrier) * order / (2 * np.pi)
-    )
+    exact = (np.angle(chirps) - 2 * np.pi * offsets[best] * turns - carrier) * order / (2 * np.pi)
+    steps = np.round(exact)
+    doubt = np.unravel_index(np.abs(exact - steps).argmax(), steps.shape)
+    side = np.sign(exact - steps)[doubt]
     for a in known.sent_by:  # as before, in the middle
         apart = np.exp(2j * np.pi * steps[a] / order) @ known.phases[a].conj()
         steps[a] -= np.round(np.angle(apart) * order / (2 * np.pi))
-    return np.exp(2j * np.pi * steps / order), float(offsets[best])
+    phases = np.exp(2j * np.pi * steps / order)
+    second = phases.copy()
+    second[doubt] *= np.exp(2j * np.pi * side / order)
+    return CarrierPhases(phases, float(offsets[best]), second)

@@ -42,6 +42,11 @@ class Prediction:
     velocity_std: np.ndarray
     weight: np.ndarray
 
+    @property
+    def reference(self) -> Prediction:
+        """Return row 0 alone."""
+        return Prediction(**{name: value[:1] for name, value in vars(self).items()})
+
 
 @dataclass(frozen=True, kw_only=True)
 class Detections:
@@ -192,10 +197,11 @@ class Reception:
     ----------
     detections : Detections
     decoded : whether data symbols were decided (a PT in a data frame with its line of sight)
+    intact : whether the check sums among the decided bits hold
     delay_symbols : (M, P) int, -1 where nothing was decided
     transitions : (M, L_tx, P/L_tx - 1) int, -1 where nothing was decided
-    bits : (bits_per_frame,) uint8, of the groups that are read, in the order of `Payload.bits_of`;
-        empty when not decoded
+    bits : (bits_per_frame,) uint8, of the groups that are read, check sums included, in the order
+        of `Payload.bits_of`; empty when not decoded
     delay_confidence : (M, P), transition_confidence : as `transitions`; larger is surer
     raw_delay_symbols : (groups read, P) int, decisions of a search that runs a few cells past the
         alphabet on both sides (so -3 and N/2 + 2 can occur), for slip detection; empty when not
@@ -241,6 +247,12 @@ class Reception:
     path_channels: tuple[PathChannels, ...] = ()
     neighbours: Neighbours | None = None
     placed: bool = True
+    intact: bool = True
+
+    @property
+    def is_read(self) -> bool:
+        """True if data were decided and their check sums hold; else they are erased."""
+        return self.decoded and self.intact
 
     @classmethod
     def undecoded(

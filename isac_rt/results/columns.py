@@ -165,7 +165,7 @@ OBSERVERS: dict[str, Column] = {
     "state": _number("state of the terminal, -1: not processed", "state", np.int8, missing=-1),
     "decoded": _number("data symbols were decided", "reception.decoded", bool),
     "latency_frames": _number(
-        "frames after which the data were read, 0: at once, -1: not, or no data",
+        "frames after which the data were read, 0: at once, -1: erased, or no data",
         "latency",
         np.int16,
         missing=-1,
@@ -213,7 +213,7 @@ OBSERVERS: dict[str, Column] = {
         dims=("symbol",),
     ),
     "symbol_erased": _number(
-        "symbols, undecided",
+        "symbols, undecided or of a frame whose check sum fails",
         lambda o: [
             o.symbols.delay_erased,
             o.symbols.dpsk_erased,

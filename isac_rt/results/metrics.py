@@ -85,7 +85,9 @@ class Resolution(NamedTuple):
 class SymbolCount:
     """Symbols and bits sent to a terminal in data mode, and what became of them; `+` pools.
 
-    Errors include what was erased (not decided). `frames` are data frames.
+    Symbols and bits are erased where they were not decided, or the frame's check sum fails; errors
+    are those decided wrongly or not at all. Bits of check sums do not count, and `bits_decoded` are
+    of frames that were read. `frames` are data frames.
     """
 
     delay_total: int = 0
@@ -117,17 +119,20 @@ def count_symbols(
     def compare(sent: np.ndarray, decided: np.ndarray) -> tuple[int, int, int]:
         if not reception.decoded:
             return sent.size, sent.size, sent.size
-        return sent.size, int((sent != decided).sum()), int((decided < 0).sum())
+        erased = int((decided < 0).sum()) if reception.intact else sent.size
+        return sent.size, int((sent != decided).sum()), erased
 
-    bits = payload.bits_of(mine)
-    decoded = bits.size if reception.decoded else 0
-    wrong = int((bits != reception.bits).sum()) if decoded else bits.size
+    useful = ~payload.is_check(mine)
+    bits = int(useful.sum())
+    wrong = bits
+    if reception.decoded:
+        wrong = int((payload.bits_of(mine) != reception.bits)[useful].sum())
     return SymbolCount(
         *compare(payload.delay_symbols[mine], reception.delay_symbols[mine]),
         *compare(payload.transitions[mine], reception.transitions[mine]),
-        bits.size,
+        bits,
         wrong,
-        decoded,
+        bits if reception.is_read else 0,
         1,
     )
 

@@ -207,8 +207,8 @@ class Recorder:
             sensing, names = Sensing.pooled([seen[link] for link in links]), timetable.first_roles
             others = {u: t for u, t in sensing.targets(list(names)).items() if u != links[0].rx}
             found = summary_block(role, sensing, symbols, duration)
-            waits = [n for link in links for n in by_link[link]["latency_frames"].tolist()]
-            return found | {"latency_frames": latencies(symbols, waits), "targets": others}
+            waits = latencies(symbols, [by_link[link] for link in links])
+            return found | {"latency_frames": waits, "targets": others}
 
         terminals = {}
         for name in dict.fromkeys(link.rx for link in timetable.all_links):

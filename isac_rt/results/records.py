@@ -139,7 +139,7 @@ class ObserverRecord:
     state : code of the terminal's state, an index into the recorder's `states`
     gospa : of the confirmed tracks against the targets in view and unshadowed
     symbols : what was sent to it and became of it
-    latency : frames after which its data were read, -1: they were not
+    latency : frames after which its data were read, -1: they were erased
     slips : symbols decided outside their alphabet
     fell_back : whether the transmitter sent the conventional schedule in place of the scenario's
         (`isac_rt.simulation.fall_back`)
@@ -171,7 +171,7 @@ class LateRecord:
     frame : its number
     reception : its symbols
     symbols : what was sent and became of it
-    latency : frames after which it was read
+    latency : frames after which it was read, -1: its check sum fails
     """
 
     frame: int

@@ -134,7 +134,7 @@ class Scorer(Stateful):
             state=received.state,
             gospa=distance,
             symbols=symbols,
-            latency=0 if reception.decoded else -1,
+            latency=0 if reception.is_read else -1,
             slips=int(((raw < 0) | (raw >= timetable.waveform.num_delay_symbols)).sum()),
             fell_back=sent.schedule is not timetable.schedule,
             reference_snr=_reference_snr(paths, sent.amplitude, noise_power),
@@ -192,7 +192,8 @@ class Scorer(Stateful):
             number = round(since / timetable.interval)
             payload, groups = timetable.payload(tx, number), timetable.groups(self.link)
             symbols = count_symbols(payload, one.reception, groups)
-            records.append(LateRecord(number, one.reception, symbols, frame - number))
+            latency = frame - number if one.reception.is_read else -1
+            records.append(LateRecord(number, one.reception, symbols, latency))
         return records
 
     def _view(self, frame: int, paths: PathSet) -> _View:

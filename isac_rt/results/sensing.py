@@ -284,20 +284,29 @@ def share(part: int, whole: int) -> float | None:
     return part / whole if whole else None
 
 
-def latencies(symbols: SymbolCount | None, waits: Sequence[int]) -> dict[str, Any] | None:
+MISREAD = 0.5
+"""Share of wrong delay or DPSK symbols from which on a frame that was read is misread."""
+
+
+def latencies(symbols: SymbolCount | None, rows: Sequence[np.ndarray]) -> dict[str, Any] | None:
     """Data frames sent to a receiver and read by it, at once or late; null where it receives none.
 
     Parameters
     ----------
     symbols : what was sent to it
-    waits : frames after which each of its frames was read, -1 where it was not
+    rows : of the receiver's links
     """
     if symbols is None:
         return None
-    read = np.array([wait for wait in waits if wait >= 0], int)
+    names = ("latency_frames", "symbol_errors", "symbol_total")
+    waits, errors, total = (np.concatenate([of[name] for of in rows]) for name in names)
+    misread = (errors > MISREAD * total)[:, :2].any(axis=1)
+    read = waits[waits >= 0]
     return {
         "sent": symbols.frames,
         "read": read.size,
+        "erased": symbols.frames - read.size,
+        "misread": int((misread & (waits >= 0)).sum()),
         "late": int((read > 0).sum()),
         "mean": float(read.mean()) if read.size else None,
         "most": int(read.max()) if read.size else None,

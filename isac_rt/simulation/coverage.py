@@ -187,7 +187,7 @@ def _bit_rate(link: Link, timetable: Timetable) -> float:
     carried = sum(
         timetable.modulated(f) for f in range(timetable.frames) if link in timetable.links(f)
     )
-    return w.bits_per_frame(order) * carried / (timetable.frames * timetable.interval)
+    return w.payload_bits(order) * carried / (timetable.frames * timetable.interval)
 
 
 class _Flight(NamedTuple):

@@ -427,7 +427,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
     dtype('complex64')
     """
     begin = Seconds.of_process()
-    waveform = waveform_of(scenario.radio, scenario.array)
+    waveform = waveform_of(scenario.radio, scenario.array, scenario.modulation)
     antennas = antennas_of(scenario.array, waveform)
     swarm = swarm_of(scenario)
     schedule = schedule_of(scenario.schedule, waveform, generator(scenario.seed, "schedule"))

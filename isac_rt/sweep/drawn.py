@@ -347,7 +347,7 @@ def _flown(tree: dict[str, Any]) -> np.ndarray:
 
 
 def _timetable(scenario: Scenario) -> Timetable:
-    waveform = waveform_of(scenario.radio, scenario.array)
+    waveform = waveform_of(scenario.radio, scenario.array, scenario.modulation)
     return timetable_of(scenario, waveform, decoded_schedule(waveform))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.special import gammainccinv
 
 from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.payload import demodulate_bits, passes_check
 from isac_rt.frame.waveform import Waveform
 from isac_rt.plain import Stateful
 from isac_rt.receive.symbols import EXTRA_CELLS
@@ -212,21 +213,37 @@ class Reference(Stateful):
         allowed[0] = min(allowed[0], MOST_CELLS * self.cells[0])
         return float(residual[0] / self.cells[0]) if (residual > allowed).any() else 0.0
 
-    def slip(self, reception: Reception) -> int:
+    def slip(self, reception: Reception, order: int) -> int:
         """Return by how many whole cells the true range exceeds the track's, as symbols outside the
-        alphabet show; 0 as long as they do not.
+        alphabet show; 0 as long as they do not, or the frame's check sum holds.
 
         With the range k cells too long every symbol is read k too low: the symbols 0..k-1 fall
         below the alphabet, and none is read in its last k places. A frame of M P chirps holds k M P
         / (N/2) of the former on average (0.7 k for the paper's numbers); two are asked for, over at
         most `EVIDENCE_FRAMES` frames, and none of the latter, which a second path in the cell would
-        leave there.
+        leave there. One will do if the check sum holds for the symbols moved.
         """
+        if reception.intact:
+            self.state.ends = []
+            return 0
         new = end_symbols(reception, self._groups, self._waveform)
         self.state.ends = [*self.state.ends, new][-EVIDENCE_FRAMES:]
         if self.track is None:
             return 0
-        return slip_cells(np.concatenate(self.state.ends), self._waveform.num_delay_symbols)
+        ends, last = np.concatenate(self.state.ends), self._waveform.num_delay_symbols - 1
+        cells = slip_cells(ends, last + 1)
+        if cells or not ((ends < 0) | (ends > last)).any():
+            return cells
+        tried = sorted(range(-EXTRA_CELLS, EXTRA_CELLS + 1), key=abs)
+        return next((k for k in tried if self._holds(reception, k, order)), 0)
+
+    def _holds(self, reception: Reception, cells: int, order: int) -> bool:
+        """Return whether a frame's check sum holds for delay symbols `cells` lower."""
+        groups = list(range(self._waveform.num_groups) if self._groups is None else self._groups)
+        w, raw = self._waveform.of_groups(groups), reception.raw_delay_symbols - cells
+        if raw.min() < 0 or raw.max() >= w.num_delay_symbols:
+            return False
+        return passes_check(demodulate_bits(raw, reception.transitions[groups], w, order), w, order)
 
     def lengthen(self, cells: int, own: Pose) -> None:
         """Add whole cells to the track's range; what is known of slips is over."""

@@ -269,7 +269,7 @@ class PassiveTerminal(Stateful):
             maps=maps,
         )
         if modulated:
-            self.reference.state.read = reception.decoded
+            self.reference.state.read = reception.is_read
         self.reference.update(reception, own_pose, self.tracker, anchored)
         self._track(reception, own)
         tracks = self._snapshot(own_pose)
@@ -314,9 +314,10 @@ class PassiveTerminal(Stateful):
     def _read(self, cube: IFCube, own: Own, modulated: bool, maps: bool) -> Reception:
         """Receive a frame; where symbols outside the alphabet show a slip, move the reference by
         whole cells and receive it again."""
+        order = self._receiver.reader.order
         expected = self.reference.prediction(self.tracker, own.pose) if modulated else None
         reception = self._receive(cube, expected, own, modulated, maps)
-        cells = self.reference.slip(reception) if reception.decoded else 0
+        cells = self.reference.slip(reception, order) if reception.decoded else 0
         track = self.reference.track
         if cells == 0 or track is None:
             return reception

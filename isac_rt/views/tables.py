@@ -35,8 +35,9 @@ def number(value: Any, digits: int = 3) -> str:
 
 LEGEND = {
     "SER delay": "SER, BER: share of the symbols or bits sent that were decided wrongly or erased.",
-    "Erased": "Erased: share of the symbols without a decision.",
-    "Bit rate [kbit/s]": "Bit rate: decided bits over the whole run, pilots and pauses included.",
+    "Erased": "Erased: share of the symbols not decided, or whose frame fails its check sum.",
+    "Bit rate [kbit/s]": "Bit rate: payload of frames read over the run, pilots and pauses in.",
+    "Misread": "Misread: frames read, with over half of their delay or DPSK symbols wrong.",
     "Late": "Late: data frames read after later ones had been received.",
     "In view": "In view: UAVs times frames in the field of view and not occluded.",
     "Found": "Found: share of those in view with a detection of their own path within one "
@@ -78,6 +79,14 @@ _RATES = {
     "Bit rate [kbit/s]": "bit_rate_bps",
 }
 
+_FRAMES = {
+    "Frames erased": "erased",
+    "Misread": "misread",
+    "Frames read": "read",
+    "Late": "late",
+    "Most frames late": "most",
+}
+
 
 def data_table(summary: Mapping[str, Any]) -> Table:
     """Decoding of the links that carry data; no rows where none does."""
@@ -91,12 +100,12 @@ def data_table(summary: Mapping[str, Any]) -> Table:
         for name, s in summary["links"].items()
         if s["ser_delay"] is not None
     ]
-    return Table(("Data", *_RATES, "Frames read", "Late", "Most frames late"), rows)
+    return Table(("Data", *_RATES, *_FRAMES), rows)
 
 
 def _waits(latency: Mapping[str, Any] | None) -> list[str]:
-    """Data frames of a link that were read, late ones among them, and by how much."""
-    return [number(None if latency is None else latency[key]) for key in ("read", "late", "most")]
+    """Data frames of a link by what became of them."""
+    return [number(None if latency is None else latency[key]) for key in _FRAMES.values()]
 
 
 def _parts(

@@ -7,7 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isac_rt.frame.payload import demodulate_bits, modulate, random_payload, unmodulated
+from isac_rt.frame.payload import (
+    demodulate_bits,
+    modulate,
+    passes_check,
+    random_payload,
+    remainder,
+    unmodulated,
+)
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 
@@ -120,6 +127,55 @@ def test_neighbouring_symbols_differ_in_one_bit():
     near = (p.delay_symbols + 1) % w.num_delay_symbols
     bits = demodulate_bits(near, (p.transitions + 1) % 16, w, 16)
     assert (bits != p.bits).sum() == p.delay_symbols.size + p.transitions.size
+
+
+def divided(bits, divisor=0b110011011):
+    """Remainder of bits by D^8 + D^7 + D^4 + D^3 + D + 1, by long division of integers."""
+    left = int("".join(map(str, bits)) or "0", 2)
+    while left.bit_length() >= divisor.bit_length():
+        left ^= divisor << left.bit_length() - divisor.bit_length()
+    return left
+
+
+def test_check_sum_is_that_of_the_standard():
+    """0xEA of "123456789" is the published check value of the CRC-8 of 3GPP TS 36.212; lengths at
+    random by long division. Planted bug: a polynomial without its D^4."""
+    text = np.unpackbits(np.frombuffer(b"123456789", np.uint8))
+    assert remainder(np.append(text, np.zeros(8, np.uint8))) == 0xEA
+    rng = np.random.default_rng(5)
+    for size in (1, 8, 9, 300):
+        bits = rng.integers(0, 2, size, dtype=np.uint8)
+        assert remainder(bits) == divided(bits)
+
+
+@pytest.mark.parametrize("checked", [None, ((0, 2), (1,))])
+def test_check_sums_hold_and_notice_errors(checked):
+    """Every set of groups ends with its own sum, which a receiver of these groups alone can test;
+    one wrong bit, and any burst within 8, fails it. Planted bug: the sums' places counted over all
+    groups."""
+    w = Waveform(num_samples=64, num_chirps=12, checked=checked)
+    schedule = pseudo_random_schedule(3, 12, 3, np.random.default_rng(2))
+    p = random_payload(w, schedule, 4, np.random.default_rng(3))
+    sets = [(0, 1, 2)] if checked is None else checked
+    assert w.bits_per_frame(4) - w.payload_bits(4) == 8 * len(sets) == p.check.size
+    for groups in sets:
+        mine, own = p.bits_of(groups), w.of_groups(groups)
+        assert divided(mine) == 0 and passes_check(mine, own, 4)
+        assert p.is_check(groups).sum() == 8 and p.is_check(groups)[-8:].all()
+        for first in range(mine.size - 7):
+            wrong = mine.copy()
+            wrong[first : first + 8] ^= np.array([1, 0, 0, 1, 0, 0, 1, first % 2], np.uint8)
+            assert not passes_check(wrong, own, 4)
+    assert w.of_groups((2,)).payload_bits(4) == w.bits_per_frame(4) // 3  # nothing to check it by
+
+
+def test_frames_without_room_carry_no_check_sum():
+    w = Waveform(num_samples=16, num_chirps=3, num_groups=1)
+    schedule = pseudo_random_schedule(1, 3, 3, np.random.default_rng(0))
+    assert w.bits_per_frame(2) == 9 and w.payload_bits(2) == 1
+    w = Waveform(num_samples=8, num_chirps=3, num_groups=1)
+    assert w.bits_per_frame(2) == w.payload_bits(2) == 6
+    assert passes_check(random_payload(w, schedule, 2, np.random.default_rng(0)).bits, w, 2)
 
 
 def test_unmodulated_frame():

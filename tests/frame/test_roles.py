@@ -95,8 +95,9 @@ def test_two_active_terminals_in_one_block_collide():
 
 
 def test_streams_reach_their_terminals():
-    """One group for P1, two for P2: each decodes its own and its rate is that of its groups.
-    Planted bug: all groups counted."""
+    """One group for P1, two for P2: each decodes its own and its rate is that of its groups, less
+    the 8 bits by which it checks them. Planted bugs: all groups counted; one check sum for all
+    groups, which neither can check."""
     streams = {"P1": (1,), "P2": (0, 2)}
     s = scenario(
         {"A": A, "P1": P1, "P2": P2},
@@ -107,7 +108,7 @@ def test_streams_reach_their_terminals():
     for name, groups in streams.items():
         block = run.summary["terminals"][name]
         assert block["ser_delay"] == block["ser_dpsk"] == block["erased"] == 0, name
-        assert block["bits"] == 4 * len(groups) * per_group
+        assert block["bits"] == 4 * (len(groups) * per_group - 8)
 
 
 def test_a_change_of_roles_in_flight():

@@ -449,6 +449,36 @@ def test_a_modulated_frame_without_prediction_is_not_read(link):
     assert not r.decoded and not r.line_of_sight and len(r.detections) == 0
 
 
+def test_tracks_in_wrong_places_do_not_cost_the_frame(link):
+    """Two further paths, and tracks of them a cell off, which vote for symbols a cell off. Where
+    the check fails the reference alone decides. Planted bug: it is not asked."""
+    w, payload, clean = link
+    places = [(62.0, 4.4), (75.0, -3.1)]
+    others = [Path(r, v, 0.8, (-0.4, 0.1)) for r, v in places]
+    line = Path(LENGTH, RATE, 1.0, ARRIVAL, DEPARTURE)
+    received = cube(w, clean.schedule, payload, [line, *others], antennas=FEW)
+    expected = predict(LENGTH, RATE, *((r - w.range_cell(1), v, 1.0) for r, v in places))
+    wrong = demodulate(received, expected, 8).raw - payload.delay_symbols
+    assert np.median(wrong) == 1
+    r = receive_passive(received, FEW, SETTINGS, 8, expected, True)
+    assert r.is_read and np.array_equal(r.bits, payload.bits)
+
+
+def test_few_wrong_symbols_erase_a_frame_and_not_its_detections(link):
+    """At -22 dB and three receivers symbols go wrong; at -19 dB only differences of phase do, which
+    are right against one carrier. Planted bugs: the check left out; phases not decided again."""
+    w, payload, clean = link
+    line = [Path(LENGTH, RATE, 1.0, ARRIVAL, DEPARTURE)]
+    for level, seed, intact in ((-19.0, 1, True), (-22.0, 2, False)):
+        noisy = cube(w, clean.schedule, payload, line, FEW, 10 ** (-level / 10), seed)
+        expected = replace(predict(LENGTH, RATE), direction=np.array([ARRIVAL]))
+        chirpwise = demodulate(noisy, expected, 8)
+        r = receive_passive(noisy, FEW, SETTINGS, 8, expected, True)
+        assert (chirpwise.transitions != payload.transitions).any()
+        assert r.decoded and r.line_of_sight and len(r.detections)
+        assert r.is_read == intact == np.array_equal(r.bits, payload.bits)
+
+
 def test_reception_of_a_frame(link):
     """The line of sight and a weak reflection: symbols, bits, the reference first, its power.
     Planted bugs: power of the strongest sample; cleaning with the clipped symbols' phases of the

@@ -233,10 +233,10 @@ def test_wrong_transitions_are_undone_by_the_path_itself():
         theta[0] / C, (theta[1] + 0.5 * w.velocity_cell(1)) / C, theta[2:4], np.ones(1), np.zeros(4)
     )
     sent = known(w, schedule, payload, FEW, 1)
-    found = decide_phases(Moments(cube.samples, replace(sent, phases=wrong)), start, 8)
+    found = decide_phases(Moments(cube.samples, replace(sent, phases=wrong)), start, 8).phases
     apart = np.abs(found - payload.phases) > 0.1
     assert (np.abs(wrong - payload.phases) > 0.1).sum() == 10 and apart.sum() <= 2
-    right = decide_phases(Moments(cube.samples, sent), start, 8)
+    right = decide_phases(Moments(cube.samples, sent), start, 8).phases
     assert (np.abs(right - payload.phases) > 0.1).sum() <= 2
     empty = noisy(w, schedule, np.zeros(cube.samples.shape), 1.0, 4)
     assert decide_phases(Moments(empty.samples, sent), start, 8) is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -95,22 +96,25 @@ def reception(payload, delay, transitions, bits, decoded=True) -> Reception:
 
 
 def test_symbol_counts():
-    """Two wrong delay symbols of which one is erased, three wrong transitions, four wrong bits; an
-    undecoded frame is all errors; a pilot counts nothing. Planted bug: erased symbols left out of
-    the errors."""
+    """Two wrong delay symbols of which one is erased, three wrong transitions, four wrong bits; the
+    frame is erased with as many errors where its check fails; an undecoded frame is all errors; a
+    pilot counts nothing; check sums are no payload. Planted bug: erased symbols left out of the
+    errors."""
     schedule = conventional_schedule(2, 12, 3)
     p = random_payload(SMALL, schedule, 8, np.random.default_rng(2))
     delay, transitions, bits = p.delay_symbols.copy(), p.transitions.copy(), p.bits.copy()
     delay[0, 3], delay[1, 7] = -1, (delay[1, 7] + 1) % 32
     transitions[0, 1, :3] = (transitions[0, 1, :3] + 1) % 8
     bits[[1, 5, 9, 20]] ^= 1
-    one = count_symbols(p, reception(p, delay, transitions, bits))
-    assert one == SymbolCount(24, 2, 1, 18, 3, 0, p.bits.size, 4, p.bits.size, 1)
+    one, size = count_symbols(p, reception(p, delay, transitions, bits)), p.bits.size - 8
+    assert one == SymbolCount(24, 2, 1, 18, 3, 0, size, 4, size, 1)
+    failed = replace(reception(p, delay, transitions, bits), intact=False)
+    assert count_symbols(p, failed) == SymbolCount(24, 2, 24, 18, 3, 18, size, 4, 0, 1)
     blank = np.zeros(0, np.uint8)
     lost = count_symbols(
         p, reception(p, np.full((2, 12), -1), np.full((2, 3, 3), -1), blank, decoded=False)
     )
-    assert lost == SymbolCount(24, 24, 24, 18, 18, 18, p.bits.size, p.bits.size, 0, 1)
+    assert lost == SymbolCount(24, 24, 24, 18, 18, 18, size, size, 0, 1)
     pilot = unmodulated(SMALL)
     assert (
         count_symbols(pilot, reception(pilot, delay, transitions, blank, decoded=False))
@@ -120,11 +124,9 @@ def test_symbol_counts():
     assert block["ser_delay"] == pytest.approx(26 / 48) and block["ser_dpsk"] == pytest.approx(
         21 / 36
     )
-    assert block["ber"] == pytest.approx((4 + p.bits.size) / (2 * p.bits.size))
+    assert block["ber"] == pytest.approx((4 + size) / (2 * size))
     assert block["erased"] == pytest.approx((1 + 24 + 18) / 84)
-    assert block["bits"] == p.bits.size and block["bit_rate_bps"] == pytest.approx(
-        p.bits.size / 0.1
-    )
+    assert block["bits"] == size and block["bit_rate_bps"] == pytest.approx(size / 0.1)
     assert block["hit_rate"] is None and block["rmse"] == dict.fromkeys(ERROR_KEYS)
 
 

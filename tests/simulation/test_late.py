@@ -68,6 +68,8 @@ def test_late_frames_are_amended(whole):
     assert block["latency_frames"] == {
         "sent": 13,
         "read": int(seen.sum()),
+        "erased": int((~seen & d.modulated.values).sum()),
+        "misread": 0,
         "late": int((late > 0).sum()),
         "mean": float(late.mean()),
         "most": int(late.max()),

@@ -17,10 +17,17 @@ from isac_rt.extensions.city_receivers.standard import (
     active_terminal,
     passive_terminal,
 )
-from isac_rt.frame.payload import random_payload, unmodulated
+from isac_rt.frame.payload import (
+    demodulate_bits,
+    modulate,
+    random_payload,
+    unmodulated,
+    with_check_sums,
+)
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
+from isac_rt.receive.types import Reception, no_detections
 from isac_rt.track.reference import TerminalState
 from isac_rt.track.settings import Tracking
 from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
@@ -140,6 +147,31 @@ def test_planted_slips_are_repaired_while_data_flow(cells):
             break
     assert pt.reference.state.slips_repaired >= 1
     assert (reception.delay_symbols == payload.delay_symbols).all()
+
+
+def test_one_symbol_outside_and_the_check_sum_tell_a_slip():
+    """One symbol below the alphabet moves the reference once the check sum holds for a move, and
+    not where it holds for none. Planted bugs: the sign of the move; the sum not asked."""
+    pt = acquired(3)
+    payload = random_payload(W, SCHEDULE, 8, np.random.default_rng(7))
+    symbols = np.maximum(payload.delay_symbols, 1)
+    symbols[0, 0] = 0
+    bits = demodulate_bits(symbols, payload.transitions, W, 8)
+    for right in (True, False):
+        whole = with_check_sums(bits, W, 8)
+        whole[-1] ^= not right
+        moved = modulate(whole, W, SCHEDULE, 8)
+        reception = replace(
+            Reception.undecoded(W, no_detections()),
+            decoded=True,
+            intact=False,
+            transitions=moved.transitions,
+            raw_delay_symbols=moved.delay_symbols - 1,
+            delay_confidence=np.full(symbols.shape, 1e3),
+            confidence_looks=ANTENNAS.num_rx,
+        )
+        pt.reference.state.ends = []
+        assert pt.reference.slip(reception, 8) == (-1 if right else 0)
 
 
 def test_a_pilot_anchors_the_range_again():

@@ -31,13 +31,15 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.vector import new_memory
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.directions import denominators, search_of, settled
+from isac_rt.receive.known import Known
 from isac_rt.receive.spectrum import transform
-from isac_rt.receive.symbols import Symbols, known_cycles, nearest_symbols
+from isac_rt.receive.symbols import Symbols, decide_by_carrier, known_cycles, nearest_symbols
 from isac_rt.receive.types import Prediction
 
-PEAKS = 4
+PEAKS = 8
 """Cells kept of every chirp. The strongest by power is the path's down to some 3 dB per cell and
-antenna; by beam one of four still is some 3 dB under that."""
+antenna; by beam one of four still is some 3 dB under that, and one of eight in all chirps of a
+frame."""
 APART = 3
 """Half cells on each side of a cell that is kept in which no further one is."""
 FASTEST = 45.0
@@ -251,7 +253,7 @@ def read_peaks(
     transitions, spread = nearest_symbols(product, order)
     sure = by_antenna(strong, peaks.schedule, w.num_tx)
     least = np.minimum(sure[..., 1:], sure[..., :-1])
-    return Symbols(
+    symbols = Symbols(
         raw=raw,
         delay=raw,
         delay_confidence=strong,
@@ -262,6 +264,10 @@ def read_peaks(
         bits=demodulate_bits(raw, transitions, w, order),
         looks=1,
     )
+    if symbols.is_intact(w, order):
+        return symbols
+    known = Known(w, peaks.schedule, raw, symbols.phases, antennas, 1)
+    return symbols.with_phases(decide_by_carrier(known, picked, order), known, order)
 
 
 @dataclass(frozen=True)
