@@ -453,8 +453,8 @@ def test_tracks_in_wrong_places_do_not_cost_the_frame(link):
     """Two further paths, and tracks of them a cell off, which vote for symbols a cell off. Where
     the check fails the reference alone decides. Planted bug: it is not asked."""
     w, payload, clean = link
-    places = [(62.0, 4.4), (75.0, -3.1)]
-    others = [Path(r, v, 0.8, (-0.4, 0.1)) for r, v in places]
+    places = [(LENGTH + n * w.range_cell(1), RATE) for n in (36, 62)]
+    others = [Path(*place, 0.9, (-0.4, 0.1)) for place in places]
     line = Path(LENGTH, RATE, 1.0, ARRIVAL, DEPARTURE)
     received = cube(w, clean.schedule, payload, [line, *others], antennas=FEW)
     expected = predict(LENGTH, RATE, *((r - w.range_cell(1), v, 1.0) for r, v in places))
