@@ -10,18 +10,22 @@ from __future__ import annotations
 import json
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from statistics import median
 
 from benchmarks.measure import cpu_seconds, floor_seconds
+from isac_rt.frame.cube import IFCube
+from isac_rt.frame.link import Link
 from isac_rt.results.recorder import Results
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
-from isac_rt.simulation.setup import Setup, prepare
+from isac_rt.simulation.setup import Frame, prepare
 from isac_rt.sweep.drawn import DataSet
-from isac_rt.sweep.shards import CARD, Samples, samples_of, tar_of
+from isac_rt.sweep.parts import FrameParts
+from isac_rt.sweep.samples import CARD, Samples
+from isac_rt.sweep.shards import samples_of, tar_of
 from reproduce import SCENES
 
 FRAMES = (4, 16)
@@ -41,7 +45,7 @@ def rows(quick: bool) -> list[dict[str, object]]:
 
 def _of(frames: int, floor: float) -> Iterator[dict[str, object]]:
     """Rows of one scene."""
-    results, setup, seconds = _simulated(frames)
+    results, parts, seconds = _simulated(frames)
     count = int(results.dataset.processed.values.sum())
 
     def row(method: str, seconds: float, also: str = "") -> dict[str, object]:
@@ -59,8 +63,8 @@ def _of(frames: int, floor: float) -> Iterator[dict[str, object]]:
             "also": f"{float(f'{1 / each:.2g}'):,g} samples/s{also}",
         }
 
-    def shard(keep: Sequence[str]) -> bytes:
-        return tar_of(samples_of(results, setup, keep, "000000"))
+    def shard(keep: tuple[str, ...]) -> bytes:
+        return tar_of(samples_of(results, parts[keep], keep, "000000"))
 
     yield row("simulated", seconds)
     for name, keep in KEEPS.items():
@@ -70,14 +74,22 @@ def _of(frames: int, floor: float) -> Iterator[dict[str, object]]:
         yield row(f"read: {name}", _read(content, count), size)
 
 
-def _simulated(frames: int) -> tuple[Results, Setup, float]:
-    """A run whose every frame is kept, and its CPU seconds."""
+def _simulated(frames: int) -> tuple[Results, dict[tuple[str, ...], FrameParts], float]:
+    """A run whose every frame is kept, its parts by what is kept of them, and its CPU seconds
+    without these."""
     scenario = load(SCENES / "street_canyon.yaml", [f"frames={frames}"])
-    simulate.run(scenario, snapshots=frames)  # compiles
+    simulate.run(scenario, progress=None, snapshots=frames)  # compiles
     begin = time.process_time()
     setup = prepare(scenario)
-    results = simulate.run(scenario, setup=setup, snapshots=frames)
-    return results, setup, time.process_time() - begin
+    parts = {keep: FrameParts(setup, keep) for keep in KEEPS.values()}
+
+    def observe(frame: Frame, link: Link, cube: IFCube) -> None:
+        for one in parts.values():
+            one(frame, link, cube)
+
+    results = simulate.run(scenario, progress=None, setup=setup, snapshots=frames, observe=observe)
+    spent = sum(sum(one.seconds) for one in parts.values())
+    return results, parts, time.process_time() - begin - spent
 
 
 def _read(content: bytes, count: int) -> float:

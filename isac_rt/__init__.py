@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from isac_rt.simulation.simulate import run as run
     from isac_rt.simulation.stations import standard_terminal as standard_terminal
     from isac_rt.sweep import Samples as Samples
+    from isac_rt.sweep import collate as collate
     from isac_rt.sweep import load_dataset as load_dataset
     from isac_rt.sweep import load_sweep as load_sweep
     from isac_rt.sweep import open_sweep as open_sweep
@@ -94,7 +95,7 @@ _NAMES = {
     "simulation.setup": "Frame Setup city_of prepare trace",
     "simulation.simulate": "run",
     "simulation.stations": "standard_terminal",
-    "sweep": "Samples load_dataset load_sweep open_sweep run_dataset run_sweep",
+    "sweep": "Samples collate load_dataset load_sweep open_sweep run_dataset run_sweep",
     "track.terminal": "ActiveTerminal PassiveTerminal",
     "views.animate": "animate write_animation",
     "views.scene": "scene_3d",

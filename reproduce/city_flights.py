@@ -169,7 +169,9 @@ class FlightJob(Job):
         from isac_rt.simulation import simulate
 
         scenario, setup = self.prepared()
-        results = simulate.run(scenario, setup=setup, threads=self.threads, snapshots=0)
+        results = simulate.run(
+            scenario, progress=None, setup=setup, threads=self.threads, snapshots=0
+        )
         return {**results.summary, "by_frame": by_frame(results)}
 
 

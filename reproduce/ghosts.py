@@ -112,7 +112,9 @@ def watch(scenario: Scenario) -> tuple[xr.Dataset, dict[str, list[tuple[TrackSet
             watched[link.rx] = passive.watch(setup, 1)
         return watched[link[1]]
 
-    dataset = simulate.run(scenario, setup=setup, terminal=terminal, snapshots=0).dataset
+    dataset = simulate.run(
+        scenario, progress=None, setup=setup, terminal=terminal, snapshots=0
+    ).dataset
     return dataset, {name: one.said for name, one in watched.items()}
 
 

@@ -730,7 +730,7 @@ OF_TESTS = (
     ),
     (
         "test_dataset::test_the_truth_of_a_sample_tells_who_is_shadowed",
-        Bug("sweep/shards.py", "bool(seen.shadowed.values[u])", "bool(seen.in_view.values[u])"),
+        Bug("sweep/shards.py", 'd["shadowed"][f, o, u]', 'd["in_view"][f, o, u]'),
     ),
     (
         "test_import::test_numbers_that_lost_their_sign_get_it_back",

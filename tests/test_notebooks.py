@@ -8,7 +8,7 @@ import pytest
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
 SOURCES = sorted(FOLDER.glob("*.py"))
-LONG = ("9_learned_detector",)
+LONG = ("9_learned_detector", "10_learned_labels")
 """A minute and more."""
 QUICK = [
     pytest.param(source, marks=pytest.mark.slow if source.stem in LONG else ())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -38,33 +39,59 @@ def schema() -> None:
     typer.echo(schema_text(), nl=False)
 
 
+class Shape(StrEnum):
+    """Formations of the targets of a new scenario."""
+
+    line = "line"
+    column = "column"
+    cross = "cross"
+
+
 def new(
     file: Annotated[Path, typer.Argument(metavar="FILE.yaml", help="The scenario to write.")],
-    footprints: Annotated[
-        Path | None,
+    city: Annotated[
+        str | None,
         typer.Option(
-            metavar="FILE",
-            help="Buildings: GeoJSON, CityJSON, GeoPackage, Shapefile, OpenStreetMap.",
+            "--city",
+            "--footprints",
+            metavar="FILE|NAME",
+            help="Buildings (GeoJSON, CityJSON, GeoPackage, Shapefile, OpenStreetMap), a mesh, "
+            "Mitsuba's XML, or a scene of Sionna RT such as munich.",
         ),
     ] = None,
     crs: Annotated[
         str | None,
-        typer.Option(metavar="EPSG:N", help="Coordinate system of a file that states none."),
+        typer.Option(metavar="EPSG:N", help="Coordinate system of a map that states none."),
     ] = None,
     terrain: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Heights of the ground, a GeoTIFF.")
     ] = None,
+    formation: Annotated[
+        Shape | None, typer.Option(help="Targets abreast, in a column, or in two that cross.")
+    ] = None,
+    uavs: Annotated[
+        int | None, typer.Option(min=1, max=40, help="Targets of the formation.", show_default="10")
+    ] = None,
+    sensor: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Plain FMCW sensor, such as awr1843.")
+    ] = None,
 ) -> None:
-    """Write a commented scenario to start from, in a street canyon or among your own buildings.
-    Adds the schema for editors and, among buildings, a picture."""
-    if footprints is None and (crs or terrain):
-        raise InputProblem("--crs and --terrain are of --footprints; give it too")
+    """Write a commented scenario to start from, in a street canyon or over your own city. Adds the
+    schema for editors and, over a city, a picture."""
+    if city is None and (crs or terrain):
+        raise InputProblem("--crs and --terrain are of --city; give it too")
+    if formation is None and uavs is not None:
+        raise InputProblem("--uavs is of --formation line, column or cross; give it too")
     with working("writing the scenario"):
-        from isac_rt.cli.starter import OwnCity, write_picture, write_starter
+        from isac_rt.cli.starter import Wanted, write_picture, write_starter
+        from isac_rt.scenario.sensors import SENSORS
 
-        own = None if footprints is None else OwnCity(footprints, crs, terrain)
-        files, notes = write_starter(file, own), tuple[str, ...]()
-    if own is not None:
+        if sensor is not None and sensor.lower() not in SENSORS:
+            raise InputProblem(f"--sensor {sensor}: there are {', '.join(SENSORS)}")
+        shape = formation.value if formation else None
+        wanted = Wanted(city, crs, terrain, shape, uavs or 10, sensor and sensor.lower())
+        files, notes = write_starter(file, wanted), tuple[str, ...]()
+    if city is not None:
         with working("drawing the scene"):
             picture, notes = write_picture(file)
             files.append(picture)

@@ -22,7 +22,7 @@ OPEN_M, HIGH_M = 1.0, 3.0
 """What rises less over the ground is open, what rises more a building."""
 ROOM_M = 3.0
 """Free space on all sides of a flight."""
-LOW_M, HIGHEST_M, OVER_ROOFS_M = 6.0, 20.0, 6.0
+LOW_M, HIGHEST_M, OVER_ROOFS_M = 4.0, 20.0, 6.0
 """Flights in a street stay so high over it, at half of the buildings' height between, others so
 high over roofs."""
 VIEW_M = 60.0
@@ -68,7 +68,7 @@ class Site:
 @dataclass(frozen=True)
 class _Map:
     """Heights of the highest and of the lowest surface in cells (rows to the north, columns to the
-    east), NaN where there is none. [m]"""
+    east), NaN where there is none, as in the cells of the rim. [m]"""
 
     corner: NDArray[np.float64]
     cell: float
@@ -86,15 +86,16 @@ def _heights(city: CityMesh) -> _Map:
     corners = city.corners + city.origin
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     cell = max(CELL_M, float((high - low)[:2].max()) / MOST_CELLS)
-    width, height = (int(np.ceil(side / cell)) + 1 for side in (high - low)[:2])
+    width, height = (int(np.ceil(side / cell)) + 3 for side in (high - low)[:2])
     half = (width * cell / 2, height * cell / 2)
-    centre = np.append(low[:2] + half, 0.0)
+    corner = low[:2] - cell  # what lies outside the city is of the rim
+    centre = np.append(corner + half, 0.0)
     maps = []
     for away in (-1.0, 1.0):
         view = View(np.diag([1.0, 1.0, away]), centre, half)
         depth, _ = depth_buffer(corners, view, width, height)
         maps.append(np.where(np.isfinite(depth), away * depth, np.nan))
-    return _Map(low[:2], cell, maps[0], maps[1])
+    return _Map(corner, cell, maps[0], maps[1])
 
 
 def site_of(city: CityMesh, formation: Formation) -> Site:
@@ -132,7 +133,7 @@ def _ranked(heights: _Map, formation: Formation) -> Iterator[Site]:
     chosen = open_cells[np.argsort(-share.ravel()[open_cells], kind="stable")][::step]
     rows, columns = np.unravel_index(chosen, rise.shape)
     middles = heights.corner + (np.column_stack([columns, rows]) + 0.5) * heights.cell
-    corridor, ahead = _corridor(formation), _ahead(formation)
+    corridor, (ahead, near) = _corridor(formation), _ahead(formation)
     found = []
     for number in range(_HEADINGS):
         heading = 2 * np.pi * number / _HEADINGS
@@ -143,8 +144,10 @@ def _ranked(heights: _Map, formation: Formation) -> Iterator[Site]:
         over = np.clip(mean[rows, columns] / 2, LOW_M, HIGHEST_M)
         z = under + np.where(street, over, OVER_ROOFS_M)
         seen = heights.top[heights.index(middles[:, None] + turn(ahead)[:, :2])]
-        walls = (seen > z[:, None] + 1.0).mean(axis=1)
-        score = (1.0 + 2.0 * street) * (0.05 + np.minimum(walls, 0.3)) * share[rows, columns]
+        walls = seen > z[:, None] + 1.0
+        nearest = (walls * near).max(axis=1)  # few buildings fill little of the view from anywhere
+        score = (0.05 + np.minimum(walls.mean(axis=1), 0.3)) * (0.1 + nearest)
+        score *= (1.0 + 2.0 * street) * share[rows, columns]
         found += [
             (-score[k], Site(np.append(middles[k], z[k]), heading))
             for k in np.flatnonzero(np.isfinite(z))
@@ -162,16 +165,16 @@ def _corridor(formation: Formation) -> NDArray[np.float64]:
     return np.column_stack([plan, np.zeros(len(plan))])
 
 
-def _ahead(formation: Formation) -> NDArray[np.float64]:
-    """Points (N, 3) over what the first terminal looks at."""
+def _ahead(formation: Formation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points (N, 3) over what the first terminal looks at, and how near they are, 1 to 0."""
     r, angle = np.meshgrid(np.linspace(8, VIEW_M, 27), np.linspace(-0.9, 0.9, 19))
     points = np.stack([r * np.sin(angle), r * np.cos(angle), 0 * r], axis=-1).reshape(-1, 3)
-    return points + formation.starts[0]
+    return points + formation.starts[0], 1 - r.ravel() / VIEW_M
 
 
 def _is_good(corners: NDArray[np.float64], flights: Formation) -> bool:
-    """Return whether flights meet no face, all UAVs see each other first and last, and a wall
-    stands in front of the first."""
+    """Return whether flights meet no face, the first two UAVs see all others first and last, and a
+    wall stands in front of the first."""
     ends = np.concatenate([flights.starts, flights.ends])
     reach = [ends.min(axis=0) - VIEW_M, ends.max(axis=0) + VIEW_M]
     near = corners[
@@ -179,7 +182,7 @@ def _is_good(corners: NDArray[np.float64], flights: Formation) -> bool:
     ]
     lines = list(zip(flights.starts, flights.ends, strict=True))
     for places in (flights.starts, flights.ends):
-        lines += [(a, b) for i, a in enumerate(places) for b in places[i + 1 :]]
+        lines += [(a, b) for i, a in enumerate(places[:2]) for b in places[i + 1 :]]
     if any(hits(near, a, b)[0].size for a, b in lines):
         return False
     start, on = flights.starts[0], flights.ends[0] - flights.starts[0]

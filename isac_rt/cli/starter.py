@@ -8,6 +8,8 @@ import re
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
+from textwrap import indent
+from typing import Any
 
 import numpy as np
 import yaml
@@ -15,9 +17,12 @@ import yaml
 from isac_rt.cli.siting import Formation, Site, site_of
 from isac_rt.results.files import ResultsError
 from isac_rt.scenario.radio import Radio
+from isac_rt.scenario.swarm import unfolded
 from isac_rt.scenario.tree import json_schema
 from isac_rt.storage import write_whole
 from isac_rt.world.city import CityMesh, load_city
+from isac_rt.world.city.meshfiles import MESHES, point_in_file
+from isac_rt.world.city.mitsuba_xml import builtin_path
 from isac_rt.world.city.place import Place, local_origin, plane_about
 from isac_rt.world.settings import City
 
@@ -27,10 +32,8 @@ _CANYON = """\
   street_width_m: 24
   building_height_m: 18
   street_length_m: 120"""
-_PLACES = ((-4.3, -30.1), (3.1, 14.7), (4.9, -9.3), (-3.7, 1.9))
-_SPEEDS = (4.0, 2.0)
-_DURATION_S = 2.0
-"""Places of AT and PT1, first and last place of U1, about the site; speeds of AT and PT1 ahead."""
+_DURATION_S, _TARGET_SPEED, _SPACING_M = 2.0, 4.0, 4.0
+"""Flights are looked at for so long; speed [m/s] and spacing [m] of targets in formation."""
 DRAWN_M = 400.0
 """So much of a city is drawn about the swarm."""
 FAR_M = 10e3
@@ -38,21 +41,28 @@ FAR_M = 10e3
 
 
 @dataclass(frozen=True)
-class OwnCity:
-    """Buildings of one's own.
+class Wanted:
+    """Choices for a new scenario.
 
     Parameters
     ----------
-    footprints : path
-    crs : str, optional
-        Coordinate reference system, where the file does not say it.
-    terrain : path, optional
-        GeoTIFF of heights.
+    city : str, optional
+        File of buildings, of a mesh or of Mitsuba, or the name of a scene of Sionna RT; None: a
+        street canyon.
+    crs, terrain : optional
+        Coordinate reference system of a map that does not say it, GeoTIFF of heights.
+    formation : str, optional
+        `line`, `column` or `cross` of `uavs` targets; None: one target on a curve.
+    sensor : str, optional
+        Plain FMCW sensor in place of terminals with data.
     """
 
-    footprints: Path
+    city: str | None = None
     crs: str | None = None
     terrain: Path | None = None
+    formation: str | None = None
+    uavs: int = 10
+    sensor: str | None = None
 
 
 def schema_text() -> str:
@@ -60,15 +70,74 @@ def schema_text() -> str:
     return json.dumps(json_schema(), indent=1) + "\n"
 
 
-def _formation() -> Formation:
-    """The flights of `_PLACES` about a site."""
-    starts = np.array([[x, y, 0.0] for x, y in _PLACES[:3]])
-    ends = np.array([starts[0], starts[1], [*_PLACES[3], 0.0]])
-    ends[:2, 1] += np.array(_SPEEDS) * _DURATION_S
-    return Formation(starts, ends)
+def _swarm(wanted: Wanted) -> dict[str, dict[str, Any]]:
+    """Return the swarm about the origin, heading to +y: two terminals that look at each other, and
+    targets between them."""
+    half, targets = _targets(wanted)
+    far, near = (-30.1, 14.7) if wanted.formation is None else (-half - 20.3, half + 15.3)
+    terminals = {
+        "AT": ("active", [-4.3, far, 0.0], [0.0, 4.0, 0.0], [0, 1, 0]),
+        "PT1": ("passive", [3.1, near, 0.0], [0.0, 2.0, 0.0], [0, -1, 0]),
+    }
+    if wanted.sensor:
+        del terminals["PT1"]
+    keys = "role", "position_m", "velocity_mps", "boresight"
+    return {name: dict(zip(keys, uav, strict=True)) for name, uav in terminals.items()} | targets
 
 
-def starter_text(name: str, city: str = _CANYON, site: Site | None = None) -> str:
+def _targets(wanted: Wanted) -> tuple[float, dict[str, dict[str, Any]]]:
+    """Return half the length of the targets' formation [m], and the targets."""
+    if wanted.formation is None:
+        curve = [(0, [4.9, -9.3, 0.0]), (2, [-3.7, 1.9, 0.0])]
+        waypoints = [{"time_s": time, "position_m": place} for time, place in curve]
+        return 0.0, {"U1": {"role": "target", "waypoints": waypoints}}
+    crossing = wanted.uavs // 2 if wanted.formation == "cross" else 0
+    begun = -_TARGET_SPEED * _DURATION_S / 2
+    half = _SPACING_M * (wanted.uavs - crossing - 1) / 2
+
+    def group(count: int, place: list[float], velocity: list[float]) -> dict[str, Any]:
+        uav = {"role": "target", "position_m": place, "velocity_mps": velocity}
+        shape = "line" if wanted.formation == "line" else "column"
+        size = {"shape": shape, "spacing_m": _SPACING_M, "count": count}
+        return uav | ({"formation": size} if count > 1 else {})
+
+    ahead = 0.0 if wanted.formation == "line" else half
+    found = {"U": group(wanted.uavs - crossing, [0.0, begun + ahead, 0.0], [0, _TARGET_SPEED, 0])}
+    if crossing:  # between the others, and higher
+        side = begun + _SPACING_M * crossing / 2
+        found["V"] = group(crossing, [side, 0.0, 2.0], [_TARGET_SPEED, 0, 0])
+    return half, found
+
+
+def _flights(swarm: dict[str, dict[str, Any]]) -> Formation:
+    """Return the straight lines of all UAVs."""
+    starts, ends = [], []
+    for uav in unfolded(swarm).values():
+        first, *_, last = uav.get("waypoints") or [uav] * 2
+        velocity = np.array(uav.get("velocity_mps", (0, 0, 0)), float)
+        starts.append(first["position_m"])
+        ends.append(last["position_m"] + velocity * _DURATION_S)
+    return Formation(np.array(starts, float), np.array(ends, float))
+
+
+def _swarm_text(swarm: dict[str, dict[str, Any]], site: Site) -> str:
+    """Return the swarm at a site as YAML."""
+
+    def at_site(key: str, value: Any) -> Any:
+        if key == "position_m":
+            return site.place(np.array([value], float))[0].round(1).tolist()
+        if key in ("velocity_mps", "boresight"):
+            return (site.turn(np.array([value], float))[0].round(3) + 0.0).tolist()
+        if key == "waypoints":
+            return [{name: at_site(name, v) for name, v in one.items()} for one in value]
+        return value
+
+    tree = {name: {key: at_site(key, v) for key, v in uav.items()} for name, uav in swarm.items()}
+    dumped = yaml.safe_dump(tree, default_flow_style=None, sort_keys=False, width=200)
+    return indent(dumped, "  ").rstrip()
+
+
+def starter_text(name: str, wanted: Wanted, city: str = _CANYON, site: Site | None = None) -> str:
     """The scenario as YAML.
 
     Parameters
@@ -80,18 +149,16 @@ def starter_text(name: str, city: str = _CANYON, site: Site | None = None) -> st
     site = Site(np.array([0.0, 0.0, 12.0]), 0.0) if site is None else site
     text = resources.files("isac_rt.cli").joinpath("starter.yaml").read_text(encoding="utf-8")
     values = {"NAME": re.sub(r"[^A-Za-z0-9_-]", "_", name)[:100], "CITY": city}
-    places = site.place(np.array([[x, y, 0.0] for x, y in _PLACES]))
-    values |= {f"P{i}": ", ".join(f"{v:.1f}" for v in place) for i, place in enumerate(places)}
-    for i, (speed, ahead) in enumerate(zip(_SPEEDS, (1.0, -1.0), strict=True)):
-        vectors = site.turn(np.array([[0.0, speed, 0.0], [0.0, ahead, 0.0]]))
-        for key, vector in zip("VB", vectors, strict=True):
-            values[f"{key}{i}"] = ", ".join(f"{round(v, 3) + 0.0:g}" for v in vector)
+    values |= {"SWARM": _swarm_text(_swarm(wanted), site), "SENSOR": f"{wanted.sensor}"}
+    other = ("sensor",) if wanted.sensor is None else ("receiver_preset", "modulation", "noise")
+    for key in other:  # with the lines that belong to it
+        text = re.sub(rf"^{key}:.*\n(?:  .*\n)*\n?", "", text, flags=re.MULTILINE)
     for key, value in values.items():
         text = text.replace(f"@{key}@", value)
     return text
 
 
-def write_starter(file: str | Path, own: OwnCity | None = None) -> list[Path]:
+def write_starter(file: str | Path, wanted: Wanted = Wanted()) -> list[Path]:
     """Write the scenario, and beside it the schema that it names. No scenario that is there is
     replaced, and no picture where `write_picture` will draw one.
 
@@ -103,13 +170,13 @@ def write_starter(file: str | Path, own: OwnCity | None = None) -> list[Path]:
     ------
     ResultsError  If the scenario or the picture is there already.
     isac_rt.storage.StorageError  If it cannot be written.
-    isac_rt.world.city.CityError  If the footprints are not what they should be.
+    isac_rt.world.city.CityError  If the city is not what it should be.
     """
     file = Path(file)
-    for made in (file, *([] if own is None else [file.with_suffix(".png")])):
+    for made in (file, *([] if wanted.city is None else [file.with_suffix(".png")])):
         if made.exists():
             raise ResultsError(f"{made} is there already; choose another name or remove it")
-    write_whole(file, starter_text(file.stem) if own is None else _over(own, file))
+    write_whole(file, _over(wanted, file))
     write_whole(file.with_name(SCHEMA), schema_text())
     return [file, file.with_name(SCHEMA)]
 
@@ -133,27 +200,59 @@ def write_picture(file: Path) -> tuple[Path, tuple[str, ...]]:
     return picture, city.notes
 
 
-def _over(own: OwnCity, file: Path) -> str:
-    """The scenario over buildings of one's own."""
-    for option, path in (("footprints", own.footprints), ("terrain", own.terrain)):
-        if path is not None and not path.is_file():
-            raise ResultsError(f"--{option} {path}: there is no such file; give one")
-    keys = {"file": os.path.relpath(own.footprints, file.parent)}
-    if own.crs is not None:
-        keys["crs"] = own.crs
-    if own.terrain is not None:
-        keys["terrain"] = os.path.relpath(own.terrain, file.parent)
-    node = City.model_validate({"source": "footprints", **keys})
+def _keys(wanted: Wanted, folder: Path) -> dict[str, str]:
+    """Return the keys of a city that a file or a name stands for.
+
+    Raises
+    ------
+    ResultsError, isac_rt.world.city.CityError  If there is no such file or scene.
+    """
+    path = Path(str(wanted.city))
+    suffix = path.suffix.lower()
+    named = not path.is_file() and not suffix and path.name == wanted.city
+    for option, one in (("city", None if named else path), ("terrain", wanted.terrain)):
+        if one is not None and not one.is_file():
+            raise ResultsError(f"--{option} {one}: there is no such file; give one")
+    source = "mitsuba" if suffix == ".xml" else "mesh" if suffix in MESHES else "footprints"
+    if (named or source != "footprints") and (wanted.crs or wanted.terrain):
+        raise ResultsError(f"--crs and --terrain are of maps, not of {path.name}; leave them out")
+    if named:
+        builtin_path(path.name)  # refuses what is none
+        return {"source": "builtin", "name": path.name}
+    keys = {"source": source, "file": os.path.relpath(path, folder)}
+    if wanted.crs is not None:
+        keys["crs"] = wanted.crs
+    if wanted.terrain is not None:
+        keys["terrain"] = os.path.relpath(wanted.terrain, folder)
+    return keys
+
+
+def _over(wanted: Wanted, file: Path) -> str:
+    """The scenario over a city, where the swarm has room."""
+    flights = _flights(_swarm(wanted))
+    if wanted.city is None:
+        if wanted.formation is None:
+            return starter_text(file.stem, wanted)
+        canyon = City.model_validate(yaml.safe_load(_CANYON))
+        city = load_city(canyon, file.parent, Radio().carrier_hz, (0.0, 0.0, 0.0))
+        return starter_text(file.stem, wanted, site=site_of(city, flights))
+    keys = _keys(wanted, file.parent)
+    node = City.model_validate(keys)
     city = load_city(node, file.parent, Radio().carrier_hz, (0.0, 0.0, 0.0))
-    site = site_of(city, _formation())
-    lines = ["  source: footprints", *(f"  {key}: {_quoted(v)}" for key, v in keys.items())]
-    if city.place is not None and _is_far(city, city.place):
-        place, site = _local(city.place, site, city)
-        x, y, z = place.origin
+    site = site_of(city, flights)
+    lines = [f"  {key}: {v if key == 'source' else _quoted(v)}" for key, v in keys.items()]
+    place = Place("", (0.0, 0.0, 0.0)) if node.source == "mesh" else city.place
+    if place is not None and _is_far(city, place):
+        place, site = _local(place, site, city)
+        origin = np.array(place.origin)
+        if node.source == "mesh":
+            origin = point_in_file(node, Path(keys["file"]), origin)
+        x, y, z = origin.tolist()
         lines.append(f"  origin: [{x!r}, {y!r}, {z:g}]  # of the world, in coordinates of the file")
-    lines += ["  height_property: height         # of each building in the file [m]"]
-    lines += ["  default_height_m: 10            # where neither it nor storeys are known"]
-    return starter_text(file.stem, "\n".join(lines), site)
+    if node.source == "footprints":
+        lines += ["  height_property: height         # of each building in the file [m]"]
+        lines += ["  default_height_m: 10            # where neither it nor storeys are known"]
+    return starter_text(file.stem, wanted, "\n".join(lines), site)
 
 
 def _quoted(text: str) -> str:

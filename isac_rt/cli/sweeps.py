@@ -131,8 +131,8 @@ def dataset(
     workers: Workers = None,
     scheduler: Scheduler = None,
 ) -> None:
-    """Simulate random scenes as a data set for machine learning. Keeps maps, paths, truth, tracks
-    and bits; after a stop the same command computes the missing scenes."""
+    """Simulate random scenes as a data set for machine learning. Keeps what its file names (maps,
+    spectra, paths, labels, ...); after a stop the same command computes the missing scenes."""
     from isac_rt.results.files import check_folder
 
     with working("drawing the scenes"):
@@ -148,4 +148,8 @@ def dataset(
     counts = {name: (len(shards), sum(shards.values())) for name, shards in card["splits"].items()}
     said = ", ".join(f"{name}: {s} scenes, {n:,} samples" for name, (s, n) in counts.items())
     say(f"{said}; {card['bytes'] / 1e6:,.1f} MB, {card['scenes_failed']} scenes failed")
-    say(f"data set in {folder}: SPLIT/NUMBER.tar (WebDataset), card.json")
+    spent = card["processor_s"]
+    if total := spent.pop("total", 0.0):
+        parts = (f"{name} {seconds / total:.0%}" for name, seconds in spent.items())
+        say(f"processor time {total:,.0f} s: {', '.join(parts)}")
+    say(f"data set in {folder}: SPLIT/NUMBER.tar (WebDataset), card.json, croissant.json")

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from threadpoolctl import threadpool_limits
 
+from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
 from isac_rt.plain import plain, restored
 from isac_rt.results.provenance import provenance
@@ -24,6 +25,7 @@ from isac_rt.scenario.tree import OWN, Scenario
 from isac_rt.simulation.fall_back import Schedules
 from isac_rt.simulation.plan import decisions, extent, mechanisms
 from isac_rt.simulation.preflight import receivers_at_work
+from isac_rt.simulation.progress import Progress, followed
 from isac_rt.simulation.resume import Resume
 from isac_rt.simulation.setup import Frame, Setup, link_budgets, prepare
 from isac_rt.simulation.stations import (
@@ -38,7 +40,7 @@ from isac_rt.track.parts import ReportedUav
 from isac_rt.track.terminal import Receiver
 
 _LOG = logging.getLogger(__name__)
-Progress = Callable[[int, int], None]
+Observe = Callable[[Frame, Link, IFCube], None]
 Jobs = dict[Link, Future[list[LinkResult]]]
 Carried = dict[Link, Future[list[dict[str, Any]]]]
 
@@ -46,19 +48,21 @@ Carried = dict[Link, Future[list[dict[str, Any]]]]
 def run(
     scenario: Scenario,
     *,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = True,
     setup: Setup | None = None,
     threads: int | None = None,
     snapshots: int = 3,
     terminal: Callable[[Setup, Link], Terminal | Receiver] = standard_terminal,
     resume: Resume | None = None,
+    observe: Observe | None = None,
 ) -> Results:
     """Simulate every frame of a scenario.
 
     Parameters
     ----------
     scenario : Scenario
-    progress : called with the frames done and the frames in all
+    progress : called with the frames done and the frames in all; True: a bar on a terminal or in a
+        notebook; False or None: nothing
     setup : from `prepare`, if it is there already
     threads : receivers at work at once; None: one more than the machine has cores
     snapshots : frames, spread over those that the active terminals process, of which maps and path
@@ -67,6 +71,8 @@ def run(
         `ActiveTerminal.receive` or `PassiveTerminal.receive` is, or a terminal, whose tracking may
         be another too
     resume : where the frames are kept meanwhile and from where a run that was stopped goes on
+    observe : called with every frame, link and cube of samples that a receiver is given, in the
+        receivers' threads; not with frames that `resume` has already
 
     Returns
     -------
@@ -80,7 +86,9 @@ def run(
     0.0
     """
     run = _Run.begin(scenario, setup, snapshots, terminal)
-    run.fly(progress, threads, resume)
+    run.observe = observe
+    with followed(progress, scenario.frames) as report:
+        run.fly(report, threads, resume)
     summary = run.summary()
     materials = {m.name: vars(m) for m in run.setup.city.materials}
     attributes = {
@@ -136,6 +144,7 @@ class _Run:
     snapshots: set[int]
     stopwatch: Stopwatch
     kept: int = 0
+    observe: Observe | None = None
 
     @classmethod
     def begin(
@@ -229,6 +238,8 @@ class _Run:
         """
         with self.stopwatch.stage("synthesis"):
             cube = frame.received(link).shared()
+        if self.observe is not None:
+            self.observe(frame, link, cube)
         if before is not None:
             before.result()
         with self.stopwatch.stage("receive"):

@@ -7,7 +7,7 @@ from isac_rt.sweep.drawn import DataPlan, load_dataset
 from isac_rt.sweep.execute import PointsLeft, run_sweep
 from isac_rt.sweep.make_dataset import run_dataset
 from isac_rt.sweep.outcomes import Outcomes, Status, assemble, open_sweep, save_dataset, status
-from isac_rt.sweep.shards import Samples
+from isac_rt.sweep.samples import Samples, collate
 from isac_rt.sweep.workers import SchedulerLost, SweepError
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "Sweep",
     "SweepError",
     "assemble",
+    "collate",
     "load_dataset",
     "load_sweep",
     "open_sweep",

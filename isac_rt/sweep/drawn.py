@@ -43,7 +43,8 @@ MOST_CELLS = 100_000
 """Of the ground that is used."""
 Metres = Annotated[float, Field(ge=-1e8, le=1e8)]
 Range = tuple[Metres, Metres]
-Kept = Literal["map", "samples", "paths", "detections", "tracks", "bits"]
+FromFrame = Literal["boxes", "mask", "range_azimuth", "range_doppler", "cube"]
+Kept = Literal["map", "paths", "detections", "tracks", "bits", FromFrame, "samples"]
 
 
 class Draw(Free):
@@ -171,8 +172,10 @@ class DataSet(Free):
     )
     """Shares of the scenes, by the name of the split."""
     keep: tuple[Kept, ...] = ("map", "paths", "detections", "tracks", "bits")
-    """What is kept of every frame and link beside the truth. `samples`, the IF samples, are the
-    largest by far."""
+    """Parts kept of every frame and link beside the truth. Receivers run only for `map`,
+    `detections` and `tracks`; `samples`, `range_doppler` and `cube` are large."""
+    about: dict[Literal["license", "creator", "url"], str] = Field({})
+    """Licence (SPDX), publisher and address, for the card in Croissant's form."""
 
     def problems(self) -> Iterator[Problem]:
         for key in self.draw:

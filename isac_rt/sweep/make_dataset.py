@@ -5,18 +5,30 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import isac_rt
+from isac_rt.frame.cube import IFCube
+from isac_rt.receive.types import Reception, no_detections
 from isac_rt.results.provenance import commit
 from isac_rt.settings import plain_tree
 from isac_rt.storage import program_fingerprint, versions, write_whole
+from isac_rt.sweep.croissant import croissant
 from isac_rt.sweep.definition import Point
 from isac_rt.sweep.drawn import DataPlan
 from isac_rt.sweep.execute import Job, Progress, connected, run_points
 from isac_rt.sweep.outcomes import Outcomes, pending
-from isac_rt.sweep.shards import CARD, COLUMNS, samples_of, tar_of
+from isac_rt.sweep.parts import FrameParts
+from isac_rt.sweep.samples import CARD
+from isac_rt.sweep.shards import COLUMNS, samples_of, tar_of
+
+CROISSANT = "croissant.json"
+FROM_RECEIVERS = {"map", "detections", "tracks"}
+"""Parts for which the receivers run."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +74,27 @@ class SceneJob(Job):
     def simulate(self) -> dict[str, Any]:
         """Run the scene, write its shard, and say what was written beside the summary."""
         from isac_rt.simulation import simulate
+        from isac_rt.simulation.stations import standard_terminal
 
         scenario, setup = self.prepared()
+        parts = FrameParts(setup, self.keep)
         results = simulate.run(
-            scenario, setup=setup, threads=self.threads, snapshots=scenario.frames
+            scenario,
+            progress=None,
+            setup=setup,
+            threads=self.threads,
+            snapshots=scenario.frames,
+            terminal=standard_terminal if FROM_RECEIVERS & {*self.keep} else lambda *_: _Deaf(),
+            observe=parts,
         )
-        content = tar_of(samples_of(results, setup, self.keep, f"{self.number:06d}"))
+        begun = time.process_time()
+        content = tar_of(samples_of(results, parts, self.keep, f"{self.number:06d}"))
         file = Path(self.split) / f"{self.number:06d}.tar"
         write_whole(Path(self.folder) / file, content)
+        spent, made = results.summary["timing_s"], sum(parts.seconds)
+        written = time.process_time() - begun
+        spent |= {"parts": made, "other": max(spent["other"] - made, 0.0), "shard": written}
+        spent["total"] += written
         shard = {
             "file": str(file),
             "sha256": hashlib.sha256(content).hexdigest(),
@@ -77,6 +102,13 @@ class SceneJob(Job):
             "samples": int(results.dataset.processed.values.sum()),
         }
         return {**results.summary, "shard": shard}
+
+
+class _Deaf:
+    """Receiver that finds nothing, for sets that keep nothing of receivers."""
+
+    def receive(self, cube: IFCube, *_: Any, **__: Any) -> Reception:
+        return Reception.undecoded(cube.waveform, no_detections())
 
 
 def run_dataset(
@@ -127,30 +159,50 @@ def run_dataset(
     return _write_card(plan, shards)
 
 
-def _write_card(plan: DataPlan, shards: Shards) -> dict[str, Any]:
+def _write_card(plan: DataPlan, folder: Shards) -> dict[str, Any]:
     """Say what a data set is, from the outcomes of its scenes, whose shards were looked at before
     or were written just now."""
-    splits: dict[str, dict[str, int]] = {name: {} for name in plan.data.splits}
-    failed, size = 0, 0
+    shards: dict[str, list[dict[str, Any]]] = {name: [] for name in plan.data.splits}
+    failed, spent = 0, Counter[str]()
     for point, scene in zip(plan.points(), plan.scenes, strict=True):
-        outcome = shards.stated(point.key)
+        outcome = folder.stated(point.key)
         if outcome is None or outcome["status"] != "done":
             failed += 1
             continue
-        splits[scene.split][outcome["shard"]["file"]] = outcome["shard"]["samples"]
-        size += outcome["shard"]["bytes"]
+        shards[scene.split].append(outcome["shard"])
+        spent.update({k: v for k, v in outcome["timing_s"].items() if isinstance(v, float)})
+    data = plan.data
     card = {
-        "name": plan.data.name,
-        "splits": splits,
+        "name": data.name,
+        "splits": {
+            name: {shard["file"]: shard["samples"] for shard in one} for name, one in shards.items()
+        },
         "scenes_failed": failed,
-        "bytes": size,
-        "columns": {name: COLUMNS[name] for name in COLUMNS if name in plan.data.keep},
-        "streets_apart": plan.data.place is not None,
-        "data_set": plan.data.model_dump(mode="json", exclude_none=True),
+        "bytes": sum(shard["bytes"] for one in shards.values() for shard in one),
+        "processor_s": dict(spent),
+        "columns": {name: COLUMNS[name] for name in COLUMNS if name in data.keep},
+        "streets_apart": data.place is not None,
+        "data_set": data.model_dump(mode="json", exclude_none=True),
         "scenario": plain_tree(plan.base),
         "program": program_fingerprint(),
         "commit": commit(),
         "versions": versions(),
     }
-    write_whole(shards.folder / CARD, json.dumps(card, indent=1) + "\n")
+    creator = data.about.get("creator", "not stated")
+    about = {
+        "name": data.name,
+        "description": f"Frames of {data.scenes} simulated scenes of {plan.base.name}: IF radar "
+        "with data of a UAV swarm over a city. card.json has the scenario and all versions.",
+        "version": "1.0.0",
+        "datePublished": time.strftime("%Y-%m-%d"),
+        "license": data.about.get("license", "not stated"),
+        "url": data.about.get("url", "."),
+        "citeAs": f"{creator}: {data.name}, made with isac_rt {isac_rt.__version__}",
+        "creator": {"@type": "sc:Organization", "name": creator},
+    }
+    write_whole(
+        folder.folder / CROISSANT,
+        json.dumps(croissant(about, shards, data.keep), indent=1) + "\n",
+    )
+    write_whole(folder.folder / CARD, json.dumps(card, indent=1) + "\n")
     return card

@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import connection, get_context, parent_process
@@ -129,8 +130,16 @@ def _safe_path() -> Iterator[None]:
 
 
 def _serve(pipe: connection.Connection, run: Callable[[Any], Ended]) -> None:
-    """Run jobs until the other end closes; in a worker."""
+    """Run jobs until the other end closes; in a worker. A warning is said once for all of them."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    show, said = warnings.showwarning, set[str]()
+
+    def once(message: Warning | str, *about: Any, **more: Any) -> None:
+        if str(message) not in said:
+            said.add(str(message))
+            show(message, *about, **more)
+
+    vars(warnings)["showwarning"] = once
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError):
         while True:

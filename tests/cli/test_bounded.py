@@ -13,7 +13,7 @@ import pytest
 from bounded import bounded_command
 
 from isac_rt.results.files import ResultsError
-from isac_rt.sweep.shards import read_card
+from isac_rt.sweep.samples import read_card
 
 MANY = 900_000
 TEXTS = {

@@ -7,6 +7,7 @@ import itertools
 import json
 import shutil
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib.image
@@ -15,12 +16,15 @@ import pytest
 import trimesh
 
 from isac_rt.cli.cli import main
+from isac_rt.cli.starter import Wanted, write_starter
 from isac_rt.scenario.file import load
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import city_of, swarm_of
+from isac_rt.world.passage import hits
 
 QUARTER = Path(__file__).parents[2] / "scenes" / "data" / "quarter.geojson"
+SQUARE = ((0, 0), (9, 0), (9, 9), (0, 9), (0, 0))
 SHELL = ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
 
 
@@ -136,10 +140,103 @@ def test_the_swarm_is_among_buildings_in_sight_and_before_a_wall(make, tmp_path)
     assert picture[..., :3].std() > 0.05
 
 
+def houses(folder: Path, boxes: Sequence[tuple[float, float, float]]) -> Path:
+    """Houses 9 m square at (x, y), with a height, in metres."""
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"building": "yes", "height": height},
+            "geometry": {
+                "type": "Polygon",
+                "coordinates": [[[x + a, y + b] for a, b in SQUARE]],
+            },
+        }
+        for x, y, height in boxes
+    ]
+    (folder / "few.geojson").write_text(
+        json.dumps({"type": "FeatureCollection", "features": features})
+    )
+    return folder / "few.geojson"
+
+
 def hit_shares(mesh: trimesh.Trimesh, start: np.ndarray, way: np.ndarray) -> np.ndarray:
     """Shares of a way (3,) at which it meets a mesh."""
     places = mesh.ray.intersects_location(start[None], way[None])[0].reshape(-1, 3)
     return (places - start) @ way / (way @ way)
+
+
+@pytest.mark.parametrize("boxes", [[(0, 0, 7)], [(-67, -102, 7), (37, 83, 6)], [(20, 5, 25)]])
+def test_over_few_houses_the_swarm_stays_over_the_ground(boxes, tmp_path):
+    """Ground under every flight, and a wall so near before the first that the picture, which is
+    102 m wide, has it. Planted bugs: flights as high as low houses, where a far one is sought and
+    found at 58 m; the ground's rim taken to go on."""
+    write_starter(tmp_path / "few.yaml", Wanted(str(houses(tmp_path, boxes))))
+    scenario = load(tmp_path / "few.yaml")
+    corners, swarm = city_of(scenario).corners + city_of(scenario).origin, swarm_of(scenario)
+    for time in (0.0, 1.0, 1.95):
+        for pose in swarm.poses(time).values():
+            assert hits(corners, pose.position, pose.position - [0, 0, 50])[0].size
+    at, walls = swarm.poses(0.0)["AT"], []
+    for angle in np.deg2rad(np.arange(-55, 56, 5)):
+        ray = at.rotation @ np.array([np.sin(angle), np.cos(angle), 0.0])
+        walls += (60 * hits(corners, at.position, at.position + 60 * ray)[1]).tolist()
+    assert min(walls) < 20
+
+
+@pytest.mark.parametrize("formation", ["line", "column", "cross"])
+def test_a_formation_has_as_many_targets_as_asked_for(formation, tmp_path):
+    """Over a canyon, by the loaded scenario: the targets fly between AT and PT1, abreast, behind
+    each other, or at right angles, and no two come nearer than a metre. Planted bug: both columns
+    of the cross at one height and time."""
+    write_starter(tmp_path / "many.yaml", Wanted(formation=formation, uavs=7))
+    scenario = load(tmp_path / "many.yaml")
+    swarm = swarm_of(scenario)
+    targets = [name for name, uav in scenario.swarm.items() if uav.role == "target"]
+    assert len(targets) == 7
+    ahead = swarm.poses(0.0)["AT"].rotation[:, 1]
+    for time in np.linspace(0, 2, 21):
+        poses = swarm.poses(time)
+        places = np.array([poses[name].position for name in targets])
+        along = (places - poses["AT"].position) @ ahead
+        assert (along > 5).all() and (
+            along < (poses["PT1"].position - poses["AT"].position) @ ahead
+        ).all()
+        apart = np.linalg.norm(places[:, None] - places, axis=2)[np.triu_indices(7, 1)]
+        assert apart.min() > 1.0
+    depth = np.ptp(along)
+    assert depth < 1e-6 if formation == "line" else depth > 11
+
+
+def test_a_sensor_and_other_cities(tmp_path, capsys):
+    """A sensor has no passive terminal and none of the data's keys; a mesh in UTM gets an origin
+    near the swarm. Planted bug: the origin of a mesh left out."""
+    write_starter(tmp_path / "s.yaml", Wanted(sensor="awr1843"))
+    scenario = load(tmp_path / "s.yaml")
+    assert scenario.radio.mode == "fmcw" and [*scenario.swarm] == ["AT", "U1"]
+    east, north = 691000.0, 5334000.0
+    box = trimesh.creation.box(bounds=[[east, north, 500], [east + 30, north + 20, 515]])
+    ground = trimesh.creation.box(
+        bounds=[[east - 70, north - 70, 499], [east + 90, north + 90, 500]]
+    )
+    (box + ground).export(tmp_path / "utm.ply")
+    write_starter(tmp_path / "m.yaml", Wanted(str(tmp_path / "utm.ply")))
+    scenario = load(tmp_path / "m.yaml")
+    assert scenario.city.source == "mesh" and scenario.city.origin[:2] == (east, north)
+    assert np.abs(swarm_of(scenario).poses(0.0)["AT"].position).max() < 150
+    write_starter(tmp_path / "b.yaml", Wanted("simple_street_canyon"))
+    assert load(tmp_path / "b.yaml").city.name == "simple_street_canyon"
+    for options, said in (
+        (["--city", "nowhere"], "there are box, "),
+        (["--city", "no.xml"], "--city no.xml: there is no such file"),
+        (
+            ["--city", str(tmp_path / "utm.ply"), "--crs", "EPSG:2056"],
+            "are of maps, not of utm.ply",
+        ),
+        (["--uavs", "3"], "--uavs is of --formation"),
+        (["--sensor", "awr"], "--sensor awr: there are awr1843"),
+    ):
+        assert main(["new", str(tmp_path / "bad.yaml"), *options]) == 2
+        assert said in capsys.readouterr().err and not (tmp_path / "bad.yaml").exists()
 
 
 @pytest.mark.sionna

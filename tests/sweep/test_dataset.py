@@ -7,7 +7,6 @@ import hashlib
 import io
 import json
 import tarfile
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -263,11 +262,12 @@ def test_samples_are_those_of_the_run(folder):
 def test_the_truth_of_a_sample_tells_who_is_shadowed():
     """Against the dataset of a run with UAVs in view, out of it and behind walls. Planted bug: in
     view instead."""
-    d = fake_run().dataset
-    view, shadow = d.in_view.values, d.shadowed.values
+    dataset = fake_run().dataset
+    d = {name: variable.values for name, variable in dataset.variables.items()}
+    view, shadow = d["in_view"], d["shadowed"]
     assert shadow.any() and (shadow != view).any() and (shadow == view).any()
     for f, o, u in np.ndindex(shadow.shape):
-        told = _truth(d, f, o)["uavs"][str(d.uav.values[u])]
+        told = _truth(d, f, o)["uavs"][str(d["uav"][u])]
         assert (told["in_view"], told["shadowed"]) == (view[f, o, u], shadow[f, o, u])
 
 
@@ -370,16 +370,17 @@ def test_long_names_of_terminals_fit_into_a_shard():
 
 @pytest.mark.slow
 def test_pytorch_takes_the_samples(folder):
-    """A `DataLoader` batches the maps of a split."""
+    """A `DataLoader` batches a split whose samples differ in size, alone and with `collate`."""
     data = pytest.importorskip("torch.utils.data")
     plan, out = plan_of(folder, STAY), folder / "out"
     for job in jobs_of(plan, out):
         run_job(job)
     _write_card(plan, Shards(out))
-    maps = Samples(out, "train", ["bits"])
-    batch = next(iter(data.DataLoader(maps, batch_size=1)))
-    assert batch["bits"].shape[0] == 1
-    assert asdict(plan.scenes[0])["split"] in ("train", "test")
+    train = Samples(out, "train", ["bits", "paths"])
+    for also in ({}, {"collate_fn": irt.collate}):
+        batch = next(iter(data.DataLoader(train, batch_size=6, **also)))
+        assert batch["bits"].shape[0] == batch["paths_valid"].shape[0] == 6
+        assert batch["truth"]["uavs"]["A"]["position_m"].shape == (6, 3)
 
 
 @pytest.mark.slow

@@ -278,6 +278,8 @@ _READERS: dict[str, Callable[[Path], Iterator[Piece]]] = {
     ".glb": _scene,
     ".gltf": _scene,
 }
+MESHES = tuple(_READERS)
+"""Endings of mesh files."""
 
 
 @contextmanager
@@ -294,7 +296,7 @@ def _readable(path: Path) -> Iterator[None]:
         ) from None
 
 
-def pieces(path: Path, formats: tuple[str, ...] = tuple(_READERS)) -> Iterator[Piece]:
+def pieces(path: Path, formats: tuple[str, ...] = MESHES) -> Iterator[Piece]:
     """The pieces of a mesh file; larger faces become triangles."""
     if path.suffix.lower() not in formats:
         raise CityError(
