@@ -149,6 +149,6 @@ EXTENSIONS = {
     "calibrated": "isac_rt.extensions.hardware.calibrate:ideal",
     "map_files": "isac_rt.extensions.city_files.tables:table_files",
     "map_buildings": "isac_rt.extensions.city_files.footprints:footprints",
-    "map_place": "isac_rt.extensions.city_files.footprints:located",
+    "map_georeference": "isac_rt.extensions.city_files.footprints:located",
 }
 """Parts that the core takes from its extensions: "module:object" by what it is there."""

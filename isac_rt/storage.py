@@ -104,12 +104,12 @@ def is_own_folder(folder: Path) -> bool:
     that others write where each can remove only their own, as `/tmp`.
     """
     named, real = Path(os.path.abspath(folder)), Path(os.path.realpath(folder))
-    for place in dict.fromkeys([named, *named.parents, real, *real.parents]):
-        fault = _fault_of(place, place in (named, real))
+    for ancestor in dict.fromkeys([named, *named.parents, real, *real.parents]):
+        fault = _fault_of(ancestor, ancestor in (named, real))
         if fault is not None:
             warnings.warn(
                 CacheWarning(
-                    f"{folder} is not used: {place} {fault}, who could plant files there; "
+                    f"{folder} is not used: {ancestor} {fault}, who could plant files there; "
                     "chmod it, or name a folder of your own"
                 ),
                 stacklevel=2,
@@ -169,7 +169,7 @@ def write_whole(file: str | Path, content: bytes | str) -> None:
         _tidy(file.parent)
     except OSError as problem:
         raise StorageError(
-            f"cannot write {file}: {problem.strerror or problem}; choose another place with --out, "
+            f"cannot write {file}: {problem.strerror or problem}; choose another --out, "
             "or make room"
         ) from problem
 

@@ -8,9 +8,9 @@
 
 # %% [markdown]
 # # A first run
-# A street canyon, traced at 77 GHz: one active terminal, one passive terminal that decodes, one
-# target. `irt.run` does all
-# of it; the cells after it take one frame apart by hand.
+# A street canyon, ray-traced at 77 GHz, with one active terminal (AT), one passive terminal (PT1)
+# that decodes the AT's data, and one target. `irt.run` simulates the whole flight. The cells after
+# it compute one frame step by step.
 
 # %%
 import matplotlib.pyplot as plt
@@ -23,13 +23,14 @@ results = irt.run(scenario)
 results
 
 # %% [markdown]
-# Everything is in one labelled dataset. Paths by kind, summed over the frames:
+# All results are in one labelled dataset. Number of paths by kind, summed over the frames:
 
 # %%
 results.dataset.path_count.sum("frame").to_pandas()
 
 # %% [markdown]
-# Plots take axes and return them. The swarm from above, and what the passive terminal followed:
+# Plots take axes and return them. Left: the swarm from above. Right: the ranges that the passive
+# terminal measured and tracked:
 
 # %%
 setup = irt.prepare(scenario)
@@ -37,7 +38,7 @@ figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4))
 figures.scene_map(left, results.dataset, setup.city)
 figures.over_time(right, results.dataset, 1, "range")
 # %% [markdown]
-# ## One frame by hand
+# ## One frame, step by step
 # Poses and paths of frame 4 at its middle:
 
 # %%
@@ -45,8 +46,8 @@ frame = setup.frame(4)
 frame.paths["AT", "PT1"]
 
 # %% [markdown]
-# What the active terminal sends, what it receives of its own chirps, what it makes of them, with
-# the clutter that it expects of the city:
+# The active terminal's samples of its own echoes, and the detections that it makes of them. The
+# receiver uses the clutter that it expects of the city:
 
 # %%
 cube = frame.samples(("AT", "AT"))

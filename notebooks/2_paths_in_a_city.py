@@ -8,7 +8,7 @@
 
 # %% [markdown]
 # # Paths in a city
-# The scene of a run to turn about: click a kind of path in the legend to hide or show it.
+# The 3-D scene of a run. Drag to rotate it; click a kind of path in the legend to hide or show it.
 
 # %%
 import matplotlib.pyplot as plt
@@ -29,15 +29,15 @@ paths = irt.trace(scenario, 0, setup=setup)
 irt.scene_3d(setup.city, setup.swarm, times, epoch, paths)
 
 # %% [markdown]
-# Every link has its paths as flat arrays: gains without the carrier phase, delays and their rates
-# in float64, directions, kinds.
+# Each link has its paths as flat arrays: gains without the carrier phase, delays and delay rates
+# in float64, directions of departure and arrival, kinds.
 
 # %%
 paths
 
 # %% [markdown]
-# Delay and Doppler shift of the paths to the passive terminal, by kind. The scatterers of the walls
-# form the ridge.
+# Delay and Doppler shift of the paths to the passive terminal, by kind. The scatterers of the
+# walls form the ridge.
 
 # %%
 received = paths["AT", "PT1"]
@@ -55,15 +55,14 @@ for kind in irt.PathKind:
 ax.set(xlabel="delay [ns]", ylabel="Doppler shift [Hz]")
 ax.legend()
 # %% [markdown]
-# Delays move with the swarm as their rates say: one frame later the line of sight has become longer
-# by rate times time, and half the
-# acceleration's share.
+# A delay in the next frame follows from its rate and acceleration in this one: the line of sight
+# changes by $\dot\tau\,\Delta t + \ddot\tau\,\Delta t^2/2$.
 
 # %%
 later = irt.trace(scenario, 1, setup=setup)["AT", "PT1"]
 dt = setup.timetable.epoch(1) - epoch
 rate, accel = received.delay_rate[0], received.delay_accel[0]
 print(
-    f"moved {1e12 * (later.delay[0] - received.delay[0]):.4f} ps, foretold "
+    f"moved {1e12 * (later.delay[0] - received.delay[0]):.4f} ps, predicted "
     f"{1e12 * (rate * dt + accel * dt**2 / 2):.4f} ps"
 )

@@ -8,11 +8,9 @@
 
 # %% [markdown]
 # # From paths to the IF signal, term by term
-# One target, one chirp after the other. A path of delay $\tau(t)$ gives, after mixing with the
-# reference chirp,
-# $f_c\tau + \alpha\tau(u-\tau/2)$ cycles, $u$ the time since the chirp began. The paper keeps a
-# part of this; here the terms
-# are added one by one until nothing is left.
+# After mixing with the reference chirp, a path of delay $\tau(t)$ has the phase $f_c\tau +
+# \alpha\tau(u-\tau/2)$ in cycles, with $u$ the time since the chirp began. The paper keeps two
+# terms of it. The cells below add the others one by one, until an error below 1e-4 is left.
 
 # %%
 import matplotlib.pyplot as plt
@@ -36,8 +34,8 @@ path = frame.paths["AT", "PT1"].select(np.array([0]))
 path
 
 # %% [markdown]
-# Its samples in the first receive antenna, by the exact model. The chirps of transmit antenna 0
-# alone, without data:
+# Samples of the path in the first receive antenna, by the exact model: the chirps of transmit
+# antenna 0, without data.
 
 # %%
 w = setup.waveform
@@ -51,10 +49,9 @@ signal = cube.samples[0, 0, chirps]
 signal = signal / np.abs(signal).mean()
 
 # %% [markdown]
-# The paper's separable model: a beat frequency for the delay at the frame's middle, a Doppler phase
-# from chirp to chirp.
-# Each further term is a phase over (chirp, sample); what is left is the relative RMS after the best
-# complex factor.
+# The paper's separable model has a beat frequency for the delay at mid-frame and a Doppler phase
+# from chirp to chirp. Each further term is a phase over (chirp, sample). The number is the
+# relative RMS error after the best complex factor.
 
 # %%
 p = chirps[:, None]
@@ -69,9 +66,7 @@ elements = [
     (frame.poses["AT"], setup.antennas.tx_positions[0], path.departure[0]),
     (frame.poses["PT1"], setup.antennas.rx_positions[0], path.arrival[0]),
 ]
-element = (
-    -sum(pose.to_world(place) @ direction for pose, place, direction in elements) / 299792458.0
-)
+element = -sum(pose.to_world(at) @ direction for pose, at, direction in elements) / 299792458.0
 terms = {
     "paper: beat and Doppler": beat + doppler,
     "+ Doppler within the chirp": w.carrier_frequency * rate * u + 0 * slot,
@@ -96,9 +91,8 @@ ax.set(xscale="log", xlabel="relative RMS that is left")
 ax.invert_yaxis()
 
 # %% [markdown]
-# The fast methods against the exact one. What `Gridded` leaves here is the curvature of the line of
-# sight's wavefront over both arrays at
-# once; the default, `Auto`, gives lines of sight to `Direct`.
+# The fast methods against the exact one. The error of `Gridded` is the curvature of the line-of-
+# sight wavefront over both arrays at once; the default, `Auto`, gives lines of sight to `Direct`.
 
 # %%
 links = [(sent, frame.paths["AT", "PT1"])]

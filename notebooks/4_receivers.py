@@ -8,9 +8,9 @@
 
 # %% [markdown]
 # # The two receivers, step by step
-# The active terminal (AT) knows its data and takes them out of its echoes; the passive one (PT)
-# decides them first and senses with the
-# same chirps. Both on one frame of the paper's swarm.
+# The active terminal (AT) knows its data and removes them from its echoes. The passive terminal
+# (PT) demodulates the data first and then senses with the same chirps. Both are shown on one frame
+# of the paper's swarm.
 
 # %%
 import matplotlib.pyplot as plt
@@ -32,7 +32,7 @@ payload.delay_symbols.shape, payload.modulated
 
 # %% [markdown]
 # ## AT: before data removal
-# Each chirp's delay symbol moves the echo to another range cell.
+# The delay symbol of each chirp moves the echo to another range cell.
 
 # %%
 cube = frame.samples(("AT", "AT"))
@@ -47,9 +47,9 @@ ax.imshow(
 )
 ax.set(xlabel="chirp", ylabel="cell", title="group 0, antenna 0, with data")
 # %% [markdown]
-# ## AT: data out, range-Doppler map, CFAR
-# `clean_spectrum` removes the delay and all four of its phases, and the DPSK; the groups are united
-# to one uniform slow time.
+# ## AT: data removal, range-Doppler map, CFAR
+# `clean_spectrum` removes the delay symbols with their phase terms and the DPSK phases. The groups
+# are combined to one uniform slow time.
 
 # %%
 r, sent_by_me = scenario.receivers, Known.of(cube, payload, setup.antennas, passes=2)
@@ -73,15 +73,16 @@ ax.plot(velocity[columns], rows * w.range_cell(2), "wo", mfc="none")
 figure.colorbar(shown, label="over the median [dB]")
 ax.set(xlabel="radial velocity [m/s]", ylabel="range [m]")
 # %% [markdown]
-# Peaks are refined off the grid; directions come from the L-shaped virtual array:
+# The detections: peaks are interpolated between the cells, and directions come from the L-shaped
+# virtual array.
 
 # %%
 irt.receive_active(cube, payload, setup.antennas, r).detections
 
 # %% [markdown]
-# ## PT: decide the data, then sense
-# It derotates every chirp by the beat that it predicts for its line of sight, and picks the
-# strongest of N/2 cells.
+# ## PT: demodulation, then sensing
+# The passive terminal derotates each chirp by the predicted beat frequency of its line of sight
+# and picks the strongest of N/2 cells.
 
 # %%
 received = frame.samples(("AT", "PT1"))

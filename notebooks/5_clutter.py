@@ -8,9 +8,9 @@
 
 # %% [markdown]
 # # Geometric against Rayleigh clutter
-# The paper puts 40 to 50 range cells of Rayleigh clutter at zero Doppler. A mesh gives something
-# else: scatterers pinned to walls and
-# ground, at the velocity that the terminal's own flight gives them, fading with distance.
+# The paper models 40 to 50 range cells of Rayleigh clutter at zero Doppler. A mesh gives
+# scatterers on walls and ground: their Doppler follows from the terminal's own velocity, and their
+# power falls with range.
 
 # %%
 from dataclasses import replace
@@ -37,7 +37,7 @@ for model in ("rayleigh", "field"):
     print(model, frame.paths["AT", "AT"])
 
 # %% [markdown]
-# The active terminal's range-Doppler maps:
+# Range-Doppler maps of the active terminal:
 
 # %%
 figure, axes = plt.subplots(1, 2, figsize=(11, 4), sharey=True)
@@ -57,10 +57,9 @@ for ax, (model, (_, got)) in zip(axes, frames.items(), strict=True):
 axes[0].set_ylabel("range [m]")
 
 # %% [markdown]
-# ## Pinned to the world
-# From one frame to the next the same scatterers return, each moved by its own rate. The range
-# profile of the city's clutter keeps its
-# shape; a model that is drawn anew does not.
+# ## Frame-to-frame correlation
+# The scatterers of a mesh are fixed in the world. Moved back by their delay rates, they correlate
+# between frames; clutter that is drawn anew in each frame does not.
 
 
 # %%

@@ -8,12 +8,11 @@
 
 # %% [markdown]
 # # A custom receiver
-# A terminal is a class with a method `receive`: samples and public knowledge in, a `Reception` out.
-# Replace it, and the rest of the run
-# (tracking, scoring, figures) stays.
+# A terminal is a class with a method `receive`, from samples and public knowledge to a
+# `Reception`. Replacing it leaves tracking, scoring and figures as they are.
 
 # %% [markdown]
-# Here an active terminal that keeps only what rises 14 dB above the median of its map.
+# This active terminal keeps only detections with an SNR above 14 dB:
 
 # %%
 from dataclasses import replace
@@ -52,7 +51,7 @@ for name, receiver in (("standard", irt.standard_terminal), ("cautious", termina
     )
 
 # %% [markdown]
-# The samples can go elsewhere too: to a file, to SigMF, to another program.
+# Samples can be exported for other receivers, for example as SigMF:
 
 # %%
 setup = irt.prepare(scenario)

@@ -8,11 +8,11 @@
 
 # %% [markdown]
 # # A sweep and its figures
-# A sweep is a scenario, axes and repetitions. It runs on all cores, keeps every finished point, and
-# goes on where it stopped.
+# A sweep is a scenario, axes and repetitions. It runs on all cores, stores each finished point,
+# and resumes where it was interrupted.
 
 # %% [markdown]
-# Four noise levels and two orders of the phase modulation, five frames each:
+# Four SNRs and two DPSK orders, five frames each:
 
 # %%
 from pathlib import Path
@@ -42,7 +42,7 @@ dataset = irt.open_sweep(folder / "out")
 dataset.sizes
 
 # %% [markdown]
-# One labelled dataset: axes are coordinates, rates have their confidence intervals.
+# The result is one labelled dataset: axes are coordinates, error rates have confidence intervals.
 
 # %%
 dataset.ser_dpsk_pooled.sel(link="AT->PT1").to_pandas()

@@ -7,14 +7,14 @@
 # ---
 
 # %% [markdown]
-# # From a measured cube to a calibrated picture
-# A radar board's antennas differ in gain, phase and delay. One strong reflector tells how, and the
-# same numbers serve every later capture of the board.
+# # Calibration of a measured cube
+# The antennas of a radar board differ in gain, phase and delay. One strong reflector calibrates
+# them, and the calibration holds for later captures of the same board.
 
 # %% [markdown]
-# Where `ISAC_RT_MEASURED` or `../shared/measured` has TI's captures, one of them is read. Elsewhere
-# a board of that kind is made up: an ideal cube, bent by gains of 1 dB, any phases, delays of 10 ps
-# and a gain that falls over the sweep, and saved as a capture.
+# The cell below reads TI's capture of a corner reflector if `ISAC_RT_MEASURED` or
+# `../shared/measured` has it. Otherwise it simulates a board with gain errors of 1 dB, random
+# phases, delay errors of 10 ps and a gain slope over the sweep, and saves it as a capture.
 
 # %%
 from pathlib import Path
@@ -58,8 +58,8 @@ capture.cube
 
 # %% [markdown]
 # ## Calibrate
-# Whatever the antennas do, one point gives amplitudes of rank one. What is not of rank one is
-# neither the reflector's nor any antenna's.
+# The amplitudes of one point reflector over all transmit and receive antennas form a matrix of
+# rank one, whatever the gains of the antennas are. The rest is coupling, noise and other echoes.
 
 # %%
 found = irt.calibrate(capture)
@@ -69,17 +69,17 @@ print(f"left of it {found.left_db:.2f} dB and {found.left_deg:.2f} degrees")
 print(f"gains scatter by {found.gain_spread_rx_db:.2f} (RX), {found.gain_spread_tx_db:.2f} dB (TX)")
 
 # %% [markdown]
-# How much of the echo the simulated cube of the same scene leaves, with ever more of the board in
-# it:
+# Power of the residual after subtracting the simulated echo, relative to the echo, as more of the
+# calibration enters the simulation:
 
 # %%
 for step, left in zip(STEPS, unexplained_by(capture, found, list(STEPS.values())), strict=True):
     print(f"{step:32s}{left:7.1f} dB")
 
 # %% [markdown]
-# ## Before and after
-# All 192 channels in phase, direction by direction. Before, the reflector is smeared over many
-# directions; after, it is a point on the boresight.
+# ## Range-azimuth maps
+# All 192 virtual channels, added in phase for each direction. Without calibration the reflector is
+# smeared over many directions; with it, it is a point at boresight.
 
 # %%
 azimuth = np.deg2rad(np.linspace(-60, 60, 241))

@@ -7,16 +7,16 @@
 # ---
 
 # %% [markdown]
-# # A detector that is learned
-# A data set of flights among blocks, a small network trained on it, and the test: does it find more
-# UAVs than CFAR, at as many false alarms, in streets that it has never seen? One to two minutes on
-# two idle cores, most of it for the data set.
+# # A learned detector
+# A data set of flights among blocks, a small network trained on it, and a test in streets outside
+# the training set: does it find more UAVs than CFAR at the same false-alarm rate? It takes one to
+# two minutes on two idle cores, most of it for the data set.
 
 # %% [markdown]
 # ## The data set
-# A radar that flies and five targets, somewhere in a quarter of 4 x 4 blocks. The quarter is cut
-# into 16 cells of 64 m; a cell belongs to the training or to the test, never to both. Positions
-# and velocities are drawn.
+# A moving radar and five targets in a quarter of 4 x 4 blocks. The quarter is cut into 16 cells of
+# 64 m, each of which belongs to either the training or the test set. Positions and velocities are
+# drawn at random.
 
 # %%
 from pathlib import Path
@@ -68,8 +68,8 @@ card = irt.run_dataset(irt.load_dataset(folder / "flights.yaml"), folder / "set"
 {split: sum(shards.values()) for split, shards in card["splits"].items()}
 
 # %% [markdown]
-# One range-Doppler map of the test. The walls that the radar flies past smear between standing
-# still and its own speed; circles are the UAVs in view.
+# One range-Doppler map of the test set. The walls smear between zero Doppler and the radar's own
+# speed. Circles: UAVs in the field of view.
 
 # %%
 splits = {
@@ -96,13 +96,12 @@ ax.set(xlim=(-17, 17), ylim=(0, 80), xlabel="velocity [m/s]", ylabel="range [m]"
 figure.colorbar(drawn, label="over the median [dB]")
 
 # %% [markdown]
-# ## What is judged
-# Every peak of a map is a candidate. CFAR judges it by its power over the background beside it. The
-# network sees the peak's surroundings, 9 x 7 cells, CFAR's ratio, and what any radar knows: range,
-# velocity, and how fast it flies itself. Neither knows the map of the city. A candidate within 1.5
-# cells of a UAV in view is that UAV; what lies over 3 cells from all of them is a false alarm,
-# ghosts included. Between the two stands a CFAR that knows as much as any moving radar's: it leaves
-# out the velocities that standing walls have.
+# ## Candidates
+# Each peak of a map is a candidate. CFAR compares its power with the background in the training
+# cells. The network's input is 9 x 7 cells about the peak, the CFAR ratio, range, velocity, and
+# the radar's own speed. Neither knows the map of the city. A candidate within 1.5 cells of a
+# visible UAV counts as that UAV; one over 3 cells from all UAVs is a false alarm, ghosts included.
+# A third detector is CFAR without the velocities that static walls have.
 
 # %%
 RULE = CfarRule(rate=1e-3, guard=(3, 3), training=(8, 6), looks=15)
@@ -145,8 +144,8 @@ judged = {split: [candidates(s) for s in of] for split, of in splits.items()}
 
 # %% [markdown]
 # ## Training
-# One hidden layer of 16, Adam, batches of 64 UAVs and 192 others, in NumPy. Nothing of the test is
-# looked at: scales and weights come from the training alone.
+# One hidden layer of 16 units, Adam, batches of 64 UAVs and 192 others, in NumPy. Scales and
+# weights come from the training set alone.
 
 # %%
 x = np.concatenate([c[0] for c in judged["train"]])
@@ -194,8 +193,8 @@ def learned(features):
 
 # %% [markdown]
 # ## The test
-# Each detector gets the threshold with which it raises as many false alarms over the test's maps as
-# the others. A UAV that is no peak at all is missed by all.
+# Each threshold gives the same number of false alarms over the maps of the test set. A UAV without
+# a peak is missed by all detectors.
 
 # %%
 test = judged["test"]
@@ -229,8 +228,8 @@ ax.set(xlabel="false alarms a map", ylabel="UAVs in view found", ylim=(0, None))
 ax.legend()
 
 # %% [markdown]
-# At one false alarm a map, with 95 % intervals. Frames of one scene are alike, so whole scenes are
-# drawn for them, 2000 times.
+# At one false alarm per map, with 95 % confidence intervals. Frames of one scene are correlated,
+# so the bootstrap draws whole scenes, 2000 times.
 
 # %%
 scene = np.array([int(s["key"][:6]) for s in splits["test"]])
@@ -254,9 +253,8 @@ for name in ("CFAR", "CFAR beside the clutter"):
     assert low > 0, "the learned detector is not shown to be better"
 
 # %% [markdown]
-# CFAR takes the edges of walls for UAVs and spends its false alarms on them; where it leaves out
-# the velocities of walls it finds nothing that flies at them. The network has learned what a UAV
-# among walls looks like at the speed that the radar flies. It is not held against the receivers
-# that know the city (`receiver_preset: city`), which whiten by the clutter that the mesh predicts:
-# here nobody has a mesh. A larger data set, the complex samples (`keep: [samples]`) and several
-# frames at once are the next steps.
+# CFAR spends its false alarms on the edges of walls. Without the velocities of walls it misses
+# UAVs that fly at them. The network separates UAVs from walls at the radar's own speed. The
+# comparison leaves out the receivers that know the city (`receiver_preset: city`) and whiten by
+# the clutter that the mesh predicts. A larger data set, complex samples (`keep: [samples]`) and
+# several frames at once are the next steps.

@@ -107,10 +107,12 @@ def _swarm(formation: str, site: Site, rng: np.random.Generator) -> dict[str, An
         f"U{k}": {"role": "target", **_uav(site, place, speed * flight)}
         for k, (place, flight) in enumerate(zip(places, flights, strict=True), start=1)
     }
-    for name, turn in zip(["AT", "PT1", "PT2"][: 1 + passive], (0.0, first, second), strict=False):
-        ahead = np.append(_along(np.deg2rad(turn)), rng.uniform(-0.1, 0.1))
+    for name, rotate in zip(
+        ["AT", "PT1", "PT2"][: 1 + passive], (0.0, first, second), strict=False
+    ):
+        ahead = np.append(_along(np.deg2rad(rotate)), rng.uniform(-0.1, 0.1))
         moving = ahead * rng.uniform(0, speed / 2)
-        out[name] = {"role": "passive" if turn else "active"}
+        out[name] = {"role": "passive" if rotate else "active"}
         out[name] |= _uav(site, -rng.uniform(*DISTANCE_M) * ahead, moving, ahead)
     return out
 
@@ -136,5 +138,5 @@ def _along(heading: Any) -> np.ndarray:
 def _uav(site: Site, place: np.ndarray, *vectors: np.ndarray) -> dict[str, list[float]]:
     """Return the place, velocity and boresight of a UAV at a site, rounded for readers."""
     keys = ("position_m", "velocity_mps", "boresight")
-    values = np.concatenate([site.place(place[None]), site.turn(np.array(vectors))]).round(3)
+    values = np.concatenate([site.place(place[None]), site.rotate(np.array(vectors))]).round(3)
     return dict(zip(keys, values.tolist(), strict=False))

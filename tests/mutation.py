@@ -165,7 +165,7 @@ EXCUSED = [
     ("kernels/signal_gridded.py", "lag[:, 1]", "and of one offset"),
     ("signal/methods.py", "* fast) % 2)", "whole turns, one or two"),
     ("extensions/access/ook.py", "total * (samples", "energies that are compared with each other"),
-    ("propagation/clutter/penumbra.py", "LIFT / side", "a quotient by a sign"),
+    ("propagation/clutter/penumbra.py", "RAY_OFFSET_M / side", "a quotient by a sign"),
     ("propagation/legs/images.py", "np.eye(6)", "the attitude of points, which no leg asks for"),
     ("extensions/access/feedback.py", "+ away.min() ** 2", "a factor that all weights share"),
     ("results/provenance.py", "timeout=20", "a limit"),

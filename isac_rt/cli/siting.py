@@ -55,14 +55,14 @@ class Site:
     middle: NDArray[np.float64]
     heading: float
 
-    def turn(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rotate(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Vectors (N, 3), ahead along +y, as of the world."""
         c, s = np.cos(self.heading), np.sin(self.heading)
         return vectors @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def place(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (N, 3) about the site as of the world."""
-        return self.turn(points) + self.middle
+        return self.rotate(points) + self.middle
 
 
 @dataclass(frozen=True)
@@ -137,13 +137,13 @@ def _ranked(heights: _Map, formation: Formation) -> Iterator[Site]:
     found = []
     for number in range(_HEADINGS):
         heading = 2 * np.pi * number / _HEADINGS
-        turn = Site(np.zeros(3), heading).turn
-        inside = heights.index(middles[:, None] + turn(corridor)[:, :2])
+        rotate = Site(np.zeros(3), heading).rotate
+        inside = heights.index(middles[:, None] + rotate(corridor)[:, :2])
         under = np.nan_to_num(heights.top[inside], nan=np.inf).max(axis=1)
         street = (rise[inside] < OPEN_M).all(axis=1)
         over = np.clip(mean[rows, columns] / 2, LOW_M, HIGHEST_M)
         z = under + np.where(street, over, OVER_ROOFS_M)
-        seen = heights.top[heights.index(middles[:, None] + turn(ahead)[:, :2])]
+        seen = heights.top[heights.index(middles[:, None] + rotate(ahead)[:, :2])]
         walls = seen > z[:, None] + 1.0
         nearest = (walls * near).max(axis=1)  # few buildings fill little of the view from anywhere
         score = (0.05 + np.minimum(walls.mean(axis=1), 0.3)) * (0.1 + nearest)
@@ -181,8 +181,8 @@ def _is_good(corners: NDArray[np.float64], flights: Formation) -> bool:
         ((corners.min(axis=1) <= reach[1]) & (corners.max(axis=1) >= reach[0])).all(axis=1)
     ]
     lines = list(zip(flights.starts, flights.ends, strict=True))
-    for places in (flights.starts, flights.ends):
-        lines += [(a, b) for i, a in enumerate(places[:2]) for b in places[i + 1 :]]
+    for positions in (flights.starts, flights.ends):
+        lines += [(a, b) for i, a in enumerate(positions[:2]) for b in positions[i + 1 :]]
     if any(hits(near, a, b)[0].size for a, b in lines):
         return False
     start, on = flights.starts[0], flights.ends[0] - flights.starts[0]

@@ -23,7 +23,7 @@ from isac_rt.storage import write_whole
 from isac_rt.world.city import CityMesh, load_city
 from isac_rt.world.city.meshfiles import MESHES, point_in_file
 from isac_rt.world.city.mitsuba_xml import builtin_path
-from isac_rt.world.city.place import Place, local_origin, plane_about
+from isac_rt.world.city.place import GeoReference, local_origin, plane_about
 from isac_rt.world.settings import City
 
 SCHEMA = "scenario.schema.json"
@@ -89,14 +89,14 @@ def _targets(wanted: Wanted) -> tuple[float, dict[str, dict[str, Any]]]:
     """Return half the length of the targets' formation [m], and the targets."""
     if wanted.formation is None:
         curve = [(0, [4.9, -9.3, 0.0]), (2, [-3.7, 1.9, 0.0])]
-        waypoints = [{"time_s": time, "position_m": place} for time, place in curve]
+        waypoints = [{"time_s": time, "position_m": geo} for time, geo in curve]
         return 0.0, {"U1": {"role": "target", "waypoints": waypoints}}
     crossing = wanted.uavs // 2 if wanted.formation == "cross" else 0
     begun = -_TARGET_SPEED * _DURATION_S / 2
     half = _SPACING_M * (wanted.uavs - crossing - 1) / 2
 
-    def group(count: int, place: list[float], velocity: list[float]) -> dict[str, Any]:
-        uav = {"role": "target", "position_m": place, "velocity_mps": velocity}
+    def group(count: int, geo: list[float], velocity: list[float]) -> dict[str, Any]:
+        uav = {"role": "target", "position_m": geo, "velocity_mps": velocity}
         shape = "line" if wanted.formation == "line" else "column"
         size = {"shape": shape, "spacing_m": _SPACING_M, "count": count}
         return uav | ({"formation": size} if count > 1 else {})
@@ -125,9 +125,9 @@ def _swarm_text(swarm: dict[str, dict[str, Any]], site: Site) -> str:
 
     def at_site(key: str, value: Any) -> Any:
         if key == "position_m":
-            return site.place(np.array([value], float))[0].round(1).tolist()
+            return site.georeference(np.array([value], float))[0].round(1).tolist()
         if key in ("velocity_mps", "boresight"):
-            return (site.turn(np.array([value], float))[0].round(3) + 0.0).tolist()
+            return (site.rotate(np.array([value], float))[0].round(3) + 0.0).tolist()
         if key == "waypoints":
             return [{name: at_site(name, v) for name, v in one.items()} for one in value]
         return value
@@ -241,10 +241,10 @@ def _over(wanted: Wanted, file: Path) -> str:
     city = load_city(node, file.parent, Radio().carrier_hz, (0.0, 0.0, 0.0))
     site = site_of(city, flights)
     lines = [f"  {key}: {v if key == 'source' else _quoted(v)}" for key, v in keys.items()]
-    place = Place("", (0.0, 0.0, 0.0)) if node.source == "mesh" else city.place
-    if place is not None and _is_far(city, place):
-        place, site = _local(place, site, city)
-        origin = np.array(place.origin)
+    geo = GeoReference("", (0.0, 0.0, 0.0)) if node.source == "mesh" else city.georeference
+    if geo is not None and _is_far(city, geo):
+        geo, site = _local(geo, site, city)
+        origin = np.array(geo.origin)
         if node.source == "mesh":
             origin = point_in_file(node, Path(keys["file"]), origin)
         x, y, z = origin.tolist()
@@ -260,21 +260,21 @@ def _quoted(text: str) -> str:
     return str(yaml.safe_dump(text, default_style='"', allow_unicode=True, width=10**9)).strip()
 
 
-def _is_far(city: CityMesh, place: Place) -> bool:
+def _is_far(city: CityMesh, geo: GeoReference) -> bool:
     """Return whether world coordinates are those of a plane about the middle, or far from their
     origin."""
-    return bool(place.plane) or float(np.abs(city.bounds() + city.origin).max()) > FAR_M
+    return bool(geo.plane) or float(np.abs(city.bounds() + city.origin).max()) > FAR_M
 
 
-def _local(place: Place, site: Site, city: CityMesh) -> tuple[Place, Site]:
+def _local(geo: GeoReference, site: Site, city: CityMesh) -> tuple[GeoReference, Site]:
     """The place with its origin near a site, on the ground, and the site there."""
     below = city.corners[..., 2] + city.origin[2]
     near = np.linalg.norm((city.corners + city.origin - site.middle)[..., :2], axis=-1) < FAR_M / 10
     level = float(np.quantile(below[near], 0.05)) if near.any() else 0.0
-    origin = local_origin(place, np.append(site.middle[:2], level))
-    plane = plane_about(origin[0], origin[1]) if place.plane and place.is_lonlat else place.plane
-    if place.plane and not place.is_lonlat:
-        origin = (place.origin[0], place.origin[1], origin[2])
-    there = replace(place, origin=origin, plane=plane)
-    middle = there.to_world(place.to_file(site.middle[None]))[0]
+    origin = local_origin(geo, np.append(site.middle[:2], level))
+    plane = plane_about(origin[0], origin[1]) if geo.plane and geo.is_lonlat else geo.plane
+    if geo.plane and not geo.is_lonlat:
+        origin = (geo.origin[0], geo.origin[1], origin[2])
+    there = replace(geo, origin=origin, plane=plane)
+    middle = there.to_world(geo.to_file(site.middle[None]))[0]
     return there, replace(site, middle=middle)

@@ -55,7 +55,7 @@ def reproduce(
         Path | None, typer.Option(metavar="DIR", help="Scenes, for flights; by default drawn.")
     ] = None,
 ) -> None:
-    """Reproduce tables, figures and claims of the paper and judge them."""
+    """Reproduce tables, figures and claims of the paper, with verdicts."""
     _from_checkout("reproduce")
     from reproduce import TITLES
     from reproduce import names as experiments

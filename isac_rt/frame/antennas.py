@@ -20,10 +20,10 @@ from isac_rt.settings import AspectTable
 from isac_rt.world.aspect import in_table
 
 PatternModel = Literal["isotropic", "sector", "cosine", "table"]
-Places = tuple[tuple[float, float], ...]
+Layout = tuple[tuple[float, float], ...]
 """Elements of an array by (x, z) in its plane [m], from any origin."""
 
-SAME_PLACE_M = 1e-6
+SAME_POSITION_M = 1e-6
 """Elements nearer than this along an axis do not tell directions along it."""
 
 
@@ -43,9 +43,9 @@ def l_shape(num_x: int, num_z: int, spacing: float, step_x: int = 1, step_z: int
 
 
 @lru_cache(maxsize=64)
-def centred(places: Places) -> np.ndarray:
+def centred(layout: Layout) -> np.ndarray:
     """Elements (L, 3) [m] in the body frame about their centroid."""
-    x, z = np.array(places, float).reshape(-1, 2).T
+    x, z = np.array(layout, float).reshape(-1, 2).T
     positions = np.stack([x, np.zeros_like(x), z], axis=1)
     positions -= positions.mean(axis=0)
     positions.setflags(write=False)
@@ -88,7 +88,7 @@ class Antennas:
     tx_x, tx_z, rx_x, rx_z : elements along each arm of an L, the corner counted in both
     spacing : distance of an L's neighbouring receive elements d_a [m]; transmit elements stand rx_x
         (rx_z) of these apart, so that an echo sees a gapless virtual L
-    tx_places, rx_places : elements of any two arrays in the plane, in place of the L's; None: the
+    tx_layout, rx_layout : elements of any two arrays in the plane, in place of the L's; None: the
         L's
     gain : power gain of an element on boresight (linear); with ``isotropic`` everywhere
     pattern : "isotropic"; "sector": `gain` inside the field of view, nothing outside;
@@ -112,8 +112,8 @@ class Antennas:
     rx_x: int = 1
     rx_z: int = 1
     spacing: float = 0.0
-    tx_places: Places | None = None
-    rx_places: Places | None = None
+    tx_layout: Layout | None = None
+    rx_layout: Layout | None = None
     gain: float = 1.0
     pattern: PatternModel = "isotropic"
     half_view: float = np.pi / 3
@@ -129,7 +129,7 @@ class Antennas:
         ------
         ValueError  If these are no two lists of finite places, one at least in each.
         """
-        places = {}
+        layouts = {}
         for name, value in (("tx", tx), ("rx", rx)):
             array = np.asarray(value, float)
             if array.ndim != 2 or array.shape[1] != 2 or not array.size:
@@ -138,34 +138,34 @@ class Antennas:
                 )
             if not np.isfinite(array).all():
                 raise ValueError(f"{name}: places must be finite numbers [m]")
-            places[name] = tuple((float(x), float(z)) for x, z in array)
-        return cls(tx_places=places["tx"], rx_places=places["rx"], **element)
+            layouts[name] = tuple((float(x), float(z)) for x, z in array)
+        return cls(tx_layout=layouts["tx"], rx_layout=layouts["rx"], **element)
 
     @property
     def is_l(self) -> bool:
         """True if both arrays are an L, whose arms can be processed one by one."""
-        return self.tx_places is None and self.rx_places is None
+        return self.tx_layout is None and self.rx_layout is None
 
     @property
     def num_tx(self) -> int:
-        return self.tx_x + self.tx_z - 1 if self.tx_places is None else len(self.tx_places)
+        return self.tx_x + self.tx_z - 1 if self.tx_layout is None else len(self.tx_layout)
 
     @property
     def num_rx(self) -> int:
-        return self.rx_x + self.rx_z - 1 if self.rx_places is None else len(self.rx_places)
+        return self.rx_x + self.rx_z - 1 if self.rx_layout is None else len(self.rx_layout)
 
     @property
     def tx_positions(self) -> np.ndarray:
         """(num_tx, 3) [m] body frame, about the centroid."""
-        if self.tx_places is not None:
-            return centred(self.tx_places)
+        if self.tx_layout is not None:
+            return centred(self.tx_layout)
         return l_shape(self.tx_x, self.tx_z, self.spacing, self.rx_x, self.rx_z)
 
     @property
     def rx_positions(self) -> np.ndarray:
         """(num_rx, 3) [m] body frame, about the centroid."""
-        if self.rx_places is not None:
-            return centred(self.rx_places)
+        if self.rx_layout is not None:
+            return centred(self.rx_layout)
         return l_shape(self.rx_x, self.rx_z, self.spacing)
 
     @property
@@ -219,9 +219,9 @@ class Antennas:
 
 @lru_cache(maxsize=64)
 def _observes(antennas: Antennas, passes: int) -> tuple[bool, bool]:
-    places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
-    span = np.ptp(places, axis=0)
-    return bool(span[0] > SAME_PLACE_M), bool(span[2] > SAME_PLACE_M)
+    positions = antennas.virtual_positions if passes == 2 else antennas.rx_positions
+    span = np.ptp(positions, axis=0)
+    return bool(span[0] > SAME_POSITION_M), bool(span[2] > SAME_POSITION_M)
 
 
 @lru_cache(maxsize=64)
@@ -231,14 +231,14 @@ def _turns(antennas: Antennas, passes: int) -> np.ndarray:
     steps = np.zeros(2)
     for axis, along in enumerate(places[:, [0, 2]].T):
         for apart in along - along.min():
-            while apart > SAME_PLACE_M:
+            while apart > SAME_POSITION_M:
                 rest = steps[axis] % apart
-                steps[axis], apart = apart, rest if apart - rest > SAME_PLACE_M else 0.0
+                steps[axis], apart = apart, rest if apart - rest > SAME_POSITION_M else 0.0
     with np.errstate(divide="ignore"):
         return 1 / steps
 
 
-def _places_of(elements: Elements | None, waveform: Waveform, cascade: int) -> Places | None:
+def _layout_of(elements: Elements | None, waveform: Waveform, cascade: int) -> Layout | None:
     """Elements that a scenario states; `cascade`: 0 for sending, 1 for receiving."""
     if elements is None:
         return None
@@ -255,8 +255,8 @@ def _places_of(elements: Elements | None, waveform: Waveform, cascade: int) -> P
 def antennas_of(a: Array, waveform: Waveform) -> Antennas:
     """The arrays that a scenario states; the spacing is in wavelengths of the carrier f_c."""
     return Antennas(
-        tx_places=_places_of(a.tx, waveform, 0),
-        rx_places=_places_of(a.rx, waveform, 1),
+        tx_layout=_layout_of(a.tx, waveform, 0),
+        rx_layout=_layout_of(a.rx, waveform, 1),
         tx_x=a.tx_x,
         tx_z=a.tx_z,
         rx_x=a.rx_x,
@@ -276,7 +276,7 @@ _CASCADE_TX = (11, 10, 9, 32, 28, 24, 20, 16, 12, 8, 4, 0)
 _CASCADE_TX_UP = (6, 4, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0)
 
 
-def ti_cascade() -> tuple[Places, Places]:
+def ti_cascade() -> tuple[Layout, Layout]:
     """Transmit (12) and receive (16) elements of TI's 4-chip cascade board MMWCAS-RF (x, z) [m], in
     the order of its channels.
 
@@ -299,9 +299,9 @@ def resolutions(waveform: Waveform, antennas: Antennas, passes: int) -> np.ndarr
     """
     cells = [waveform.range_cell(passes), waveform.velocity_cell(passes)]
     if not antennas.is_l:
-        places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
+        positions = antennas.virtual_positions if passes == 2 else antennas.rx_positions
         return np.array(
-            [*cells, *(waveform.wavelength / aperture_of(places[:, i]) for i in (0, 2))]
+            [*cells, *(waveform.wavelength / aperture_of(positions[:, i]) for i in (0, 2))]
         )
     across = antennas.rx_x * (antennas.tx_x if passes == 2 else 1)
     up = antennas.rx_z * (antennas.tx_z if passes == 2 else 1)
@@ -312,5 +312,5 @@ def resolutions(waveform: Waveform, antennas: Antennas, passes: int) -> np.ndarr
 def aperture_of(along: np.ndarray) -> float:
     """Length [m] of an array with elements at `along` (L,): from the first to the last and one mean
     step more, which is n d of a filled row; next to nothing where all stand at one place."""
-    steps = np.unique(np.round(along / SAME_PLACE_M)).size - 1
-    return float(np.ptp(along) * (steps + 1) / steps) if steps else SAME_PLACE_M
+    steps = np.unique(np.round(along / SAME_POSITION_M)).size - 1
+    return float(np.ptp(along) * (steps + 1) / steps) if steps else SAME_POSITION_M

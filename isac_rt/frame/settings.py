@@ -75,7 +75,7 @@ STATED_SHARE = 1e-2
 
 _MOST_BLOCKS = 10**9
 """More come of numbers that no chirp has, and are refused as these."""
-SKIRT_SHARE = 0.02
+TRANSITION_SHARE = 0.02
 """Width of the IF filter's skirts over the sampling rate; the paper names none."""
 
 
@@ -346,7 +346,7 @@ class Elements(Node):
         if self.shape != "positions" and self.positions is not None:
             said = f"has no meaning with shape {self.shape}; leave it out, or set shape: positions"
             yield Problem((("positions",), ("shape",)), said)
-        far = max((abs(v) for place in self.positions or () for v in place), default=0.0)
+        far = max((abs(v) for position in self.positions or () for v in position), default=0.0)
         if far > FARTHEST:
             said = f"{far:g} is no place in an array, {FARTHEST:g} is the farthest; correct it"
             yield Problem((("positions",),), said)

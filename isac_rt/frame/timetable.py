@@ -169,5 +169,5 @@ class Timetable:
             for f in range(0, self.frames, self.active_every)
             if f >= self.modulation.acquisition_frames or not self.waveform.carries_data
         ] or [0]
-        places = np.linspace(0, len(received) - 1, min(count, len(received)))
-        return {received[i] for i in places.round().astype(int)}
+        index = np.linspace(0, len(received) - 1, min(count, len(received)))
+        return {received[i] for i in index.round().astype(int)}

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from isac_rt.frame.settings import (
-    SKIRT_SHARE,
+    TRANSITION_SHARE,
     Array,
     ChirpTimes,
     Modulation,
@@ -369,7 +369,7 @@ def waveform_of(r: Radio, a: Array, modulation: Modulation | None = None) -> Wav
         num_chirps=r.chirps_per_frame,
         num_groups=r.groups,
         num_tx=num_tx,
-        filter_transition=SKIRT_SHARE * r.sampling_rate_hz,
+        filter_transition=TRANSITION_SHARE * r.sampling_rate_hz,
         sweep=sweep,
         carries_data=r.mode == "isac",
         scheme=scheme if r.bands(num_tx) > 1 and scheme != "simo" else "tdm",

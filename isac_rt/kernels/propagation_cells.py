@@ -15,7 +15,7 @@ FINER = 4.0
 
 
 @jit
-def leaves(faces, places, boxes, density, most):
+def leaves(faces, positions, boxes, density, most):
     """`isac_rt.propagation.clutter.cells.leaves`; `boxes` hold the places, `BOX` in each."""
     corners, area, face_states = faces
     room = max(2 * area.size, 1024)
@@ -44,13 +44,13 @@ def leaves(faces, places, boxes, density, most):
                 first, last = 0, last - first
             leaves, waiting = (rows, codes, areas, states, points), (line_codes, line_areas)
             at = row, face_states[row], count, first, last
-            around = line, spans, places, boxes, density, most
+            around = line, spans, positions, boxes, density, most
             count, first, last = _cut_face(at, leaves, waiting, *around)
     return count, rows[:count], codes[:count], areas[:count], states[:count], points[:count]
 
 
 @jit(borrows=True)
-def _cut_face(at, leaves, waiting, line, spans, places, boxes, density, most):
+def _cut_face(at, leaves, waiting, line, spans, positions, boxes, density, most):
     """Cut the waiting cells of a face further, until none is left, there is no room, or there are
     more than `most`; the new number of leaves, and the first and last of those that wait."""
     row, state, count, first, last = at
@@ -66,18 +66,18 @@ def _cut_face(at, leaves, waiting, line, spans, places, boxes, density, most):
         reach = size / per_metre if size > smallest else 0.0
         if FINER * size > smallest:
             reach = max(reach, min(FINER * size / per_metre, near))
-        if reach == 0 or not _near(line[first], reach, places, boxes, spans[first]):
+        if reach == 0 or not _near(line[first], reach, positions, boxes, spans[first]):
             rows[count], codes[count], areas[count] = row, line_codes[first], size
             states[count] = _hashed(state, line_codes[first])
             _place(line[first], states[count], points[count])
             count, first = count + 1, first + 1
             continue
-        apart = _halve(line[first], line[last], line[last + 1]) / 6  # of a half's centroid
+        offset = _halve(line[first], line[last], line[last + 1]) / 6  # of a half's centroid
         for half in range(2):
             line_codes[last + half] = line_codes[first] * np.uint64(2) + np.uint64(half)
             line_areas[last + half] = line_areas[first] / 2
-            spans[last + half, 0] = spans[first, 0] - apart
-            spans[last + half, 1] = spans[first, 1] + apart
+            spans[last + half, 0] = spans[first, 0] - offset
+            spans[last + half, 1] = spans[first, 1] + offset
         first, last = first + 1, last + 2
     return count, first, last
 
@@ -102,7 +102,7 @@ def _place(corners, state, point):
 
 
 @jit(borrows=True)
-def _near(corners, limit, places, boxes, span):
+def _near(corners, limit, points, boxes, span):
     """Return whether a place is nearer than `limit` to a triangle (3, 3): to the nearest point of a
     sphere about its centroid that holds it. `span` bounds the distance from the centroid to the
     nearest place; places are searched only where it leaves the answer open, and it is exact
@@ -123,8 +123,8 @@ def _near(corners, limit, places, boxes, span):
         dz = max(boxes[b, 0, 2] - z, z - boxes[b, 1, 2], 0.0)
         if _square(dx, dy, dz) > (1 + ALIKE) * least:
             continue
-        for k in range(b * BOX, min((b + 1) * BOX, len(places))):
-            least = min(least, _square(places[k, 0] - x, places[k, 1] - y, places[k, 2] - z))
+        for k in range(b * BOX, min((b + 1) * BOX, len(points))):
+            least = min(least, _square(points[k, 0] - x, points[k, 1] - y, points[k, 2] - z))
     span[0] = span[1] = np.sqrt(least)
     return max(span[0] - reach, 0.0) < limit
 

@@ -8,7 +8,7 @@ from isac_rt.kernels.jit import jit
 
 
 @jit
-def near(starts, ends, before, total, places, radii, spared, wavelength, reach):
+def near(starts, ends, before, total, positions, radii, spared, wavelength, reach):
     """Find the path segments (K,) that pass a disc (N,) within reach of its edge.
 
     Returns
@@ -22,8 +22,8 @@ def near(starts, ends, before, total, places, radii, spared, wavelength, reach):
         square = sx * sx + sy * sy + sz * sz
         row = i if len(spared) > 1 else 0
         for n in range(len(radii)):
-            wx, wy = places[n, 0] - starts[i, 0], places[n, 1] - starts[i, 1]
-            wz, radius = places[n, 2] - starts[i, 2], radii[n]
+            wx, wy = positions[n, 0] - starts[i, 0], positions[n, 1] - starts[i, 1]
+            wz, radius = positions[n, 2] - starts[i, 2], radii[n]
             dot = sx * wx + sy * wy + sz * wz
             if dot <= 0 or dot >= square or spared[row, n]:
                 continue

@@ -11,9 +11,9 @@ MOST_TRIED = 24
 
 
 @jit(inline=True)
-def _off(place, source, ahead, length):
+def _off(position, source, ahead, length):
     """Square of the distance of a place from the straight way of a length from a source."""
-    x, y, z = place[0] - source[0], place[1] - source[1], place[2] - source[2]
+    x, y, z = position[0] - source[0], position[1] - source[1], position[2] - source[2]
     along = min(max(x * ahead[0] + y * ahead[1] + z * ahead[2], 0.0), length)
     x, y, z = x - along * ahead[0], y - along * ahead[1], z - along * ahead[2]
     return x * x + y * y + z * z

@@ -1,4 +1,4 @@
-"""Templates of paths in a few range rows: matched with the samples there, and added to them."""
+"""Templates of paths in a few range rows: correlation with the samples, and addition to them."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from isac_rt.kernels.vector import (
 
 _NONE = np.float32(0)
 STENCIL = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1], [1, -1], [1, 1]])
-"""Places of a stencil down and across: its middle, the cross, the corners."""
+"""Points of a stencil (down, across): middle, cross, corners."""
 
 
 class Chirps(NamedTuple):
-    """Samples of `rows` range rows, float32: of each chirp and row the real and imaginary parts of
-    `blocks` times sixteen receivers; and of each chirp its weight, time [s] and antenna, the first
-    two filled up to a multiple of sixteen. `tile`: room for sixteen times sixteen."""
+    """Samples of `rows` range rows, float32: for each chirp and row the real and imaginary parts of
+    `blocks` times 16 receivers; weight, time [s] and antenna of each chirp, the first two padded to
+    a multiple of 16. `tile`: buffer of 16 x 16."""
 
     data: np.ndarray
     rows: int
@@ -54,8 +54,8 @@ class WindowAxis(NamedTuple):
 
 @jit(fast=True, borrows=True)
 def _square(flat, start, to_next, lanes, count, tile):
-    """Fill the tile with `count` complex values of each of `lanes` receivers, `to_next` apart from
-    `start` on, and turn it over: real and imaginary parts of one value of all receivers."""
+    """Load `count` complex values of `lanes` receivers, at a stride of `to_next` from `start`, and
+    transpose them: real and imaginary parts of one value of all receivers."""
     if lanes < LANES or count < LANES // 2:
         tile[:] = _NONE
     for r in range(lanes):
@@ -93,25 +93,26 @@ def gather(spectra, low, share, chirps):
 
 @jit(fast=True, borrows=True)
 def _template(chirps, axis, first, delay, delay_rate, steps, out):
-    """Fill a path's template for the sixteen chirps from `first` on, sixteen float32 each: weighted
-    cosine and sine, weight times the sum of the rows' squared factors, and the rows' real factors.
-    Beat, phase and `hann_response`; a test holds them against these. `steps` : cosine and sine from
-    the first row to each."""
+    """Compute a path's template for 16 chirps from `first` on, 16 float32 each: weighted cosine and
+    sine, weight times the sum of the rows' squared factors, and the rows' real factors. `steps`:
+    cosine and sine of the phase from the first row to each."""
     carrier, slope, middle, duration, length, share, low = axis
     weight, tau = narrow(load(chirps.weight, first)), delay + delay_rate * load(chirps.time, first)
+    # equation (1) of `isac_rt.receive.estimate`: beat in cells of the window, then phase
     near = (slope * tau + delay_rate * (carrier + slope * (middle - tau))) * duration
     near = (near - low) * share
-    turns, chirp, half = carrier * tau, slope * tau * (middle - 0.5 * tau), 0.5 * near
-    cycles = turns - floor(turns) + chirp - floor(chirp)
+    carrier_cycles, chirp, half = carrier * tau, slope * tau * (middle - 0.5 * tau), 0.5 * near
+    cycles = carrier_cycles - floor(carrier_cycles) + chirp - floor(chirp)
     c, s = cos_sin_exact(cycles - floor(cycles + 0.5))
     store(out, 0, weight * c)
     store(out, LANES, weight * s)
+    # window's transform in each row: sin(pi d) by the addition theorem, over pi d (1 - d^2)
     c, s = cos_sin_double(half - floor(half + 0.5))
     energy = splat(_NONE)
     for k in range(chirps.rows):
         d = near - k * share
         value, under = s * steps[0, k] - c * steps[1, k], np.pi * d * (1.0 - d * d)
-        # at its middle and at the ends of its lobe the quotient is 1 and 1/2
+        # limits of the quotient: 1 at d = 0, 1/2 at |d| = 1
         at_hole, inside = not_above(under * under, splat(1e-16)), not_above(d * d, splat(0.25))
         value = value + at_hole * (0.5 + 0.5 * inside - value)
         under = under + at_hole * (1.0 - under)
@@ -123,8 +124,7 @@ def _template(chirps, axis, first, delay, delay_rate, steps, out):
 
 @jit(inline=True)
 def _add_chirp(chirps, chirp, template, lane, out, to):
-    """Add to out[to:] conj(template) times the data of a chirp, which has that lane of the
-    template."""
+    """Add conj(template) times the data of a chirp to out[to:]; `lane` of the template."""
     rows, data = chirps.rows, chirps.data
     line = 2 * LANES * chirps.blocks
     c, s = template[lane], template[LANES + lane]
@@ -211,6 +211,7 @@ def estimate(spectra, chirps, axis, lows, counts, delays, rates, steps, units, o
             step, stencil = steps[number], STENCIL[: 5 if number else len(STENCIL)]
             across = doppler + step * stencil[:, 1]
             taus = (beat + step * stencil[:, 0] - across * coupling) * delay_unit
+            # objective (2) on the stencil, then a Newton step
             powers = _explained(here, about, taus, across * rate_unit, energy.shape[1])
             down, up, mixed = newton(powers, step, mixed)
             beat, doppler = beat + down, doppler + up
@@ -220,7 +221,7 @@ def estimate(spectra, chirps, axis, lows, counts, delays, rates, steps, units, o
 
 
 @jit
-def add_template(spectra, rows, channels, schedule, beat, turn, sent, received, window):
+def add_template(spectra, rows, channels, schedule, beat, phasor, sent, received, window):
     """`isac_rt.receive.pursuit.add_template`."""
     length, size = window
     share = length / size
@@ -231,10 +232,12 @@ def add_template(spectra, rows, channels, schedule, beat, turn, sent, received, 
         for rx in range(spectra.shape[1]):
             for p in range(num_chirps):
                 tx = schedule[m, p]
+                # offset from the first row in cells of the window; amplitude of the chirp
                 near[p] = (beat[m, p] + sent[tx] + received[rx] - rows[0]) * share
                 sine[p], cosine[p] = np.sin(np.pi * near[p]), np.cos(np.pi * near[p])
-                factor[p] = channels[tx, rx] * turn[m, p] * (length / 2)
+                factor[p] = channels[tx, rx] * phasor[m, p] * (length / 2)
             for i in range(rows[1] - rows[0]):
+                # sin(pi d) of row i by the addition theorem; phase about the window's start
                 c, s = np.cos(np.pi * share * i), np.sin(np.pi * share * i)
                 angle = np.pi * share * (rows[0] + i)
                 back = complex(np.cos(angle), -np.sin(angle))

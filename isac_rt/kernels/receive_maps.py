@@ -30,14 +30,15 @@ def fill_tones(frequency, out):
     in float64, times those of sixteen from 0."""
     blocks, flat = out.shape[1] // LANES, out.reshape(-1).view(np.float32)
     whole = blocks + -blocks % LANES
-    places, starts, at = np.arange(whole).astype(np.float64), np.empty(2 * whole, np.float32), 0
+    index, starts = np.arange(whole).astype(np.float64), np.empty(2 * whole, np.float32)
+    at = 0
     for p in range(frequency.size):
         for b in range(0, whole, LANES):
-            cycles = LANES * frequency[p] * load(places, b)
+            cycles = LANES * frequency[p] * load(index, b)
             c, s = cos_sin_double(cycles - floor(cycles + 0.5))
             store(starts, b, narrow(c))
             store(starts, whole + b, narrow(s))
-        cycles = frequency[p] * load(places, 0)
+        cycles = frequency[p] * load(index, 0)
         c, s = cos_sin_double(cycles - floor(cycles + 0.5))
         lr, li = narrow(c), narrow(s)
         for b in range(blocks):
@@ -49,7 +50,7 @@ def fill_tones(frequency, out):
 
 
 @jit(borrows=True)
-def make_maps(flat, shape, ends, places, factors, workspace, maps, buffer, power):
+def make_maps(flat, shape, ends, index, factors, workspace, maps, buffer, power):
     """`isac_rt.receive.maps.make_maps`; unsigned places, so that no index is checked for its sign.
 
     An operator is a real matrix before the DFT, so that its rows of opposite bins are conjugates.
@@ -63,7 +64,7 @@ def make_maps(flat, shape, ends, places, factors, workspace, maps, buffer, power
         for first in range(0, num_rows, ROWS):
             last = min(first + ROWS, num_rows)
             for tx in range(ends.size - 1):
-                sent = places[ends[tx] : ends[tx + 1]]
+                sent = index[ends[tx] : ends[tx + 1]]
                 for block in range(factors.shape[0]):
                     at = (block * factors.shape[1] + ends[tx]) * 2 * PART
                     for i in range(first, last, 3):
@@ -80,7 +81,7 @@ def make_maps(flat, shape, ends, places, factors, workspace, maps, buffer, power
 
 
 @jit(borrows=True)
-def _three_rows(samples, rows, places, operators, at, workspace, first, part):
+def _three_rows(samples, rows, index, operators, at, workspace, first, part):
     """A block of bins and the opposite ones, of three rows at once: their twelve sums, both factors
     and a sample's two parts fill the registers of a processor that has sixteen."""
     flat, before, step = samples
@@ -93,8 +94,8 @@ def _three_rows(samples, rows, places, operators, at, workspace, first, part):
     ax0, bx0, ay0, by0 = zero, zero, zero, zero
     ax1, bx1, ay1, by1 = zero, zero, zero, zero
     ax2, bx2, ay2, by2 = zero, zero, zero, zero
-    for s in range(places.size):
-        p, a, b = places[s], load_part(operators, at), load_part(operators, at + PART)
+    for s in range(index.size):
+        p, a, b = index[s], load_part(operators, at), load_part(operators, at + PART)
         x, y = flat[r0 + p], flat[r0 + p + imag]
         ax0, bx0, ay0, by0 = ax0 + a * x, bx0 + b * x, ay0 + a * y, by0 + b * y
         x, y = flat[r1 + p], flat[r1 + p + imag]

@@ -17,26 +17,26 @@ class Tables(NamedTuple):
 
     table: np.ndarray
     factors: np.ndarray
-    turns: np.ndarray
+    phasors: np.ndarray
     added: np.ndarray
     tapered: np.ndarray
 
 
 @jit(borrows=True)
-def transform(samples, factor, turn, powers, out, radices, twiddles, place, at, work):
+def transform(samples, factor, phasor, powers, out, radices, twiddles, lane_order, at, work):
     """`isac_rt.receive.spectrum.fill_cells`."""
-    table, factors, turns, added, tapered = work
-    num_rx, num_chirps, size = samples.shape[0], samples.shape[1], place.size
+    table, factors, phasors, added, tapered = work
+    num_rx, num_chirps, size = samples.shape[0], samples.shape[1], lane_order.size
     lines = samples.reshape(num_rx * num_chirps, 2 * size)
     zero = np.int64(0)  # a bare 0 has what it is given to compiled for 0 too
     for first in range(0, num_chirps, LANES):
         count = min(LANES, num_chirps - first)
         _fill(factor, zero, first, count, factors)
-        for i in range(turns.size // ROW):
+        for i in range(phasors.size // ROW):
             for lane in range(count):
-                turns[i * ROW + lane], turns[i * ROW + LANES + lane] = (
-                    turn[i, 2 * (first + lane)],
-                    turn[i, 2 * (first + lane) + 1],
+                phasors[i * ROW + lane], phasors[i * ROW + LANES + lane] = (
+                    phasor[i, 2 * (first + lane)],
+                    phasor[i, 2 * (first + lane) + 1],
                 )
         added[:], tapered[:] = 0.0, 0.0
         for r in range(num_rx):
@@ -44,10 +44,10 @@ def transform(samples, factor, turn, powers, out, radices, twiddles, place, at, 
             _multiply(table, factors)
             lanefft.transform(table, zero, size, radices, twiddles)
             if added.size:
-                _add_power(table, place, added)
+                _add_power(table, lane_order, added)
             if tapered.size:
-                _add_tapered(table, place, tapered)
-            _write(table, at, turns, first, count, out[r])
+                _add_tapered(table, lane_order, tapered)
+            _write(table, at, phasors, first, count, out[r])
         _unload(added, first, count, powers[0])
         _unload(tapered, first, count, powers[1])
 
@@ -80,19 +80,19 @@ def _multiply(table, factors):
 
 
 @jit(borrows=True)
-def _add_power(table, place, added):
-    for k in range(place.size):
-        a, b = load(table, place[k]), load(table, place[k] + LANES)
+def _add_power(table, lane_order, added):
+    for k in range(lane_order.size):
+        a, b = load(table, lane_order[k]), load(table, lane_order[k] + LANES)
         store(added, k * LANES, load(added, k * LANES) + (a * a + b * b))
 
 
 @jit(borrows=True)
-def _add_tapered(table, place, added):
-    half, quarter, last = splat(np.float32(0.5)), splat(np.float32(0.25)), place[-1]
+def _add_tapered(table, lane_order, added):
+    half, quarter, last = splat(np.float32(0.5)), splat(np.float32(0.25)), lane_order[-1]
     before, before_im = load(table, last), load(table, last + LANES)
-    a, b = load(table, place[0]), load(table, place[0] + LANES)
-    for k in range(place.size):
-        after = place[k + 1] if k + 1 < place.size else place[0]
+    a, b = load(table, lane_order[0]), load(table, lane_order[0] + LANES)
+    for k in range(lane_order.size):
+        after = lane_order[k + 1] if k + 1 < lane_order.size else lane_order[0]
         c, d = load(table, after), load(table, after + LANES)
         re = half * a - quarter * (before + c)
         im = half * b - quarter * (before_im + d)
@@ -109,15 +109,15 @@ def _unload(added, first, count, power):
 
 
 @jit
-def _write(table, at, turns, first, count, out):
+def _write(table, at, phasors, first, count, out):
     """out[i, first + l] = the cells, times g where there is one; past the caches where whole cache
     lines are written, which are not read from memory first then."""
     flat, width, buffer = out.reshape(-1), out.shape[1], np.empty(ROW, np.float32)
     whole = out.ctypes.data % 64 == 0 and width % LANES == 0
     for i in range(at.size):
         a, b = load(table, at[i]), load(table, at[i] + LANES)
-        if turns.size:
-            c, d = load(turns, i * ROW), load(turns, i * ROW + LANES)
+        if phasors.size:
+            c, d = load(phasors, i * ROW), load(phasors, i * ROW + LANES)
             a, b = a * c - b * d, a * d + b * c
         to = i * width + 2 * first
         if whole and count % (LANES // 2) == 0:

@@ -1,16 +1,15 @@
-r"""Many paths that noise covers, through lines much finer than the grid of fast-time frequency.
+r"""IF samples of below-noise paths, through lines much finer than the grid of fast-time frequency.
 
-In each chirp a path is a tone between two lines. At every receive element a share f of it goes to
-the upper one and the rest to the lower one, f by its place between them, the delays of its elements
-included. The lines, not the paths, are then spread on the grid. Between which lines a path lies is
-decided a few times in a frame, f for every few chirps, and amplitudes z for every chirp: a path
-costs two sums of products for each receive element. With theta the turn over half a chirp from line
-to line and x the time from the middle of the chirp, what is left out of a path is f (1 - f) theta^2
-(x^2 - 1/3)/2, and the quadratic phase of motion away from the middle of the chirp: see
-`below_noise_error`.
+In a chirp a path is a tone between two lines. At each receive element linear interpolation gives a
+share f of it to the upper line and 1 - f to the lower one; f includes the delays of the elements.
+The lines, not the paths, are then spread on the grid. The pair of lines is chosen a few times per
+frame, f for every few chirps, the amplitude z for each chirp: a path costs two products and sums
+per receive element. With theta the phase over half a chirp from line to line and x the time from
+mid-chirp, the error of a path is f (1 - f) theta^2 (x^2 - 1/3)/2 and the quadratic phase of its
+motion (`below_noise_error`).
 
-Data delay all paths alike by D: they move the lines over the grid and turn a line of beat F by
-exp(-j 2 pi F D).
+A data delay D is common to all paths: it shifts the lines on the grid and multiplies a line of beat
+frequency F by exp(-j 2 pi F D).
 """
 
 from __future__ import annotations
@@ -39,21 +38,21 @@ from isac_rt.kernels.vector import (
 
 LINES = 8
 """Lines to a step of the grid."""
-TOGETHER = 12
+CHIRPS_PER_BATCH = 12
 """Chirps for which the paths are read once."""
-MOVED = 0.5
+MAX_LINE_SHIFT = 0.5
 """Lines that paths may move by until the lines beside them are sought anew, where that takes longer
 than a batch of chirps."""
 TAPS = 4
 """Grid points that a line is spread on."""
-FLOOR = 2e-3
+LINE_ERROR = 2e-3
 """Error of a path on a line: four weights, to which twelve are fitted besides."""
 EXTRA = 2
 """Degree of the weights' polynomials above the width."""
 _ACROSS = 3  # chirps whose sums stay in registers, with the same shares
-_Z = 2 * LANES * TOGETHER  # float32 of 16 paths' amplitudes in these chirps
+_Z = 2 * LANES * CHIRPS_PER_BATCH  # float32 of 16 paths' amplitudes in these chirps
 _SUM = 2 * LANES  # float32 of a line's sums in a chirp
-_LINE = _SUM * TOGETHER  # and in these chirps
+_LINE = _SUM * CHIRPS_PER_BATCH  # and in these chirps
 _BLOCK = 32  # lines whose sums stay in the nearest caches
 _BITS = LANES.bit_length() - 1  # n >> _BITS is n // LANES, which would mind the sign of n
 _NONE, _ONE = np.float32(0), np.float32(1)
@@ -67,9 +66,9 @@ class BelowNoisePaths(NamedTuple):
     ----------
     groups : (G, 4) link, offset, first path, and the one after its last
     phase : (L_tx, K) of each transmit element, at mid-frame and in the middle of a chirp [cycles]
-    turn, curvature : (K,) by which it changes [cycles/s, cycles/s^2]
+    phase_rate, curvature : (K,) its rate and half its second derivative [cycles/s, cycles/s^2]
     amplitude : (L_tx, K) float32
-    place, drift : (K,) on the grid, at mid-frame and by the second
+    position, drift : (K,) on the grid at mid-frame [points], and its rate [points/s]
     late : (L_tx, K) float32, by how many lines a transmit element's delay moves it
     steer : (48 K,) float32, of each path phasors of 16 receive elements, real and imaginary, and
         by how many lines their delays move it
@@ -79,10 +78,10 @@ class BelowNoisePaths(NamedTuple):
 
     groups: np.ndarray
     phase: np.ndarray
-    turn: np.ndarray
+    phase_rate: np.ndarray
     curvature: np.ndarray
     amplitude: np.ndarray
-    place: np.ndarray
+    position: np.ndarray
     drift: np.ndarray
     late: np.ndarray
     steer: np.ndarray
@@ -91,7 +90,7 @@ class BelowNoisePaths(NamedTuple):
 
 
 class Batches(NamedTuple):
-    """In which order chirps are made.
+    """Order in which chirps are made.
 
     Attributes
     ----------
@@ -104,7 +103,7 @@ class Batches(NamedTuple):
 
 
 class Buffer(NamedTuple):
-    """Where lines are spread.
+    """Grid on which lines are spread.
 
     Attributes
     ----------
@@ -128,7 +127,7 @@ class Workspace(NamedTuple):
     ----------
     z, share : of each path the amplitudes in the chirps of a batch, and the upper line's share
     sums : of each line, and of the one after the last, in every chirp
-    place, weights, shift : within a grid step, of the `LINES` lines in one; in every chirp the
+    position, weights, shift : within a grid step, of the `LINES` lines in one; in every chirp the
         weights of these, and the whole lines that its data move all lines by
     factor : of each line in every chirp
     lines, begin, end : a block of lines and the paths above each
@@ -139,7 +138,7 @@ class Workspace(NamedTuple):
     z: np.ndarray
     share: np.ndarray
     sums: np.ndarray
-    place: np.ndarray
+    position: np.ndarray
     weights: np.ndarray
     shift: np.ndarray
     factor: np.ndarray
@@ -151,13 +150,13 @@ class Workspace(NamedTuple):
     antenna: np.ndarray
 
 
-def line_turn(size: int, half: float) -> float:
-    """Turn over half a chirp from line to line [rad]."""
+def line_phase(size: int, half: float) -> float:
+    """Return the phase over half a chirp from line to line [rad]."""
     return 2 * np.pi * half / (size * LINES)
 
 
 def no_paths(num_tx: int) -> BelowNoisePaths:
-    """None at all."""
+    """Return an empty set of paths."""
     none, of_each = np.zeros(0), np.zeros((num_tx, 0))
     narrow_none = of_each.astype(np.float32)
     return BelowNoisePaths(
@@ -177,21 +176,21 @@ def no_paths(num_tx: int) -> BelowNoisePaths:
 
 def make_workspace(paths: BelowNoisePaths) -> Workspace:
     """Room for the sums of these paths."""
-    blocks = paths.turn.size // LANES
+    blocks = paths.phase_rate.size // LANES
     return Workspace(
         unset(blocks * _Z),
-        unset(blocks * LANES * (TOGETHER // _ACROSS)),
+        unset(blocks * LANES * (CHIRPS_PER_BATCH // _ACROSS)),
         aligned((_BLOCK + 1) * _LINE),
         np.arange(LANES) / LINES - 0.5,
-        aligned(TOGETHER * TAPS * LANES),
-        np.zeros(TOGETHER, np.int64),
-        aligned(TOGETHER * 2 * _BLOCK),
+        aligned(CHIRPS_PER_BATCH * TAPS * LANES),
+        np.zeros(CHIRPS_PER_BATCH, np.int64),
+        aligned(CHIRPS_PER_BATCH * 2 * _BLOCK),
         np.zeros(_BLOCK),
         np.zeros(_BLOCK, np.int64),
         np.zeros(_BLOCK, np.int64),
-        np.zeros(TOGETHER, np.complex128),
-        np.zeros((TOGETHER, 2)),
-        np.zeros(TOGETHER, np.int64),
+        np.zeros(CHIRPS_PER_BATCH, np.complex128),
+        np.zeros((CHIRPS_PER_BATCH, 2)),
+        np.zeros(CHIRPS_PER_BATCH, np.int64),
     )
 
 
@@ -213,18 +212,18 @@ def batches(antenna: np.ndarray, slots: int) -> Batches:
     begin = np.flatnonzero(np.r_[True, new])
     length = np.diff(np.r_[begin, order.size])
     rows = [
-        (first, min(TOGETHER, start + count - first), part[order[start]])
+        (first, min(CHIRPS_PER_BATCH, start + count - first), part[order[start]])
         for start, count in zip(begin, length, strict=True)
-        for first in range(start, start + count, TOGETHER)
+        for first in range(start, start + count, CHIRPS_PER_BATCH)
     ]
     return Batches(order, np.array(rows, np.int64).reshape(-1, 3))
 
 
 def part_slots(waveform: Any, rate: np.ndarray, size: int) -> int:
-    """Slots of a part of the frame, in which paths move by no more than `MOVED`: whole batches, one
-    at least."""
+    """Return the slots in which paths move by `MAX_LINE_SHIFT` at most: whole batches, one at
+    least."""
     moved = float(np.abs(rate).max(initial=0.0)) * waveform.slot_duration * _lines(waveform, size)
-    return TOGETHER * max(int(MOVED / max(moved * TOGETHER, 1e-3)), 1)
+    return CHIRPS_PER_BATCH * max(int(MAX_LINE_SHIFT / max(moved * CHIRPS_PER_BATCH, 1e-3)), 1)
 
 
 def _lines(waveform: Any, size: int) -> float:
@@ -238,7 +237,7 @@ def below_noise_error(waveform: Any, tones: Any, size: int) -> np.ndarray:
 
     Four parts, added in power: what two lines leave of a path between them or, by its motion and
     its elements' delays, beyond one of them; shares of the middle of a few chirps; the quadratic
-    phase; and `FLOOR`.
+    phase; and `LINE_ERROR`.
 
     Parameters
     ----------
@@ -246,27 +245,30 @@ def below_noise_error(waveform: Any, tones: Any, size: int) -> np.ndarray:
     """
     w, t, rate = waveform, tones, np.abs(tones.rate)
     half, lines = w.num_samples / 2, _lines(waveform, size)
-    moved = np.maximum(rate * TOGETHER * w.slot_duration * lines, MOVED) / 2
+    moved = np.maximum(rate * CHIRPS_PER_BATCH * w.slot_duration * lines, MAX_LINE_SHIFT) / 2
     late = (np.ascontiguousarray(d.T) for d in (t.tx_delay, t.rx_delay))  # rows are short
     beyond = moved + lines * sum(np.abs(d).max(axis=0) for d in late)
     # most of f (1 - f), f between the lines, or on one of them and evenly that far to both sides
     between = np.maximum(0.25, np.sqrt(beyond**2 / 3 + beyond**4 / 5))
-    turn = line_turn(size, half)
+    step = line_phase(size, half)
     # parts are as long as the fastest path lets them, and cut fewer of the few when they are long
     order, parts = batches(t.antenna[0], w.num_chirps)
-    stale = rate * _apart(w, order, parts) * lines * turn
+    stale = rate * _time_spread(w, order, parts) * lines * step
     curvature = np.pi * w.slope * rate * (w.sample_interval * half) ** 2 * 2
     spread = np.sqrt(1 / 5 - 1 / 9)  # of x^2
     return np.sqrt(
-        (turn**2 / 2 * between * spread) ** 2 + stale**2 / 3 + (curvature * spread) ** 2 + FLOOR**2
+        (step**2 / 2 * between * spread) ** 2
+        + stale**2 / 3
+        + (curvature * spread) ** 2
+        + LINE_ERROR**2
     )
 
 
-def _apart(waveform: Any, order: np.ndarray, parts: np.ndarray) -> float:
-    """RMS of the time from the middle of the chirps that have the same shares [s]."""
+def _time_spread(waveform: Any, order: np.ndarray, parts: np.ndarray) -> float:
+    """Return the RMS time of chirps from the middle of the batch that has the same shares [s]."""
     w = waveform
-    place = np.concatenate([np.arange(count) for count in parts[:, 1]])
-    few = np.repeat(np.arange(len(parts)), parts[:, 1]) * TOGETHER + place // _ACROSS
+    position = np.concatenate([np.arange(count) for count in parts[:, 1]])
+    few = np.repeat(np.arange(len(parts)), parts[:, 1]) * CHIRPS_PER_BATCH + position // _ACROSS
     group, slot = np.divmod(order, w.num_chirps)
     time = slot * w.slot_duration + group * w.group_spacing
     _, number, count = np.unique(few, return_inverse=True, return_counts=True)
@@ -318,14 +320,14 @@ def below_noise_paths(
     element = delay + extra
     factor = t.factor[path] * t.tx_gain[path].T if t.tx_gain.size else t.factor[path]
     cycles = element * (carrier - w.slope / 2 * element) + bow * centre
-    place = (w.slope * delay + rate * sent) * ts * size
+    position = (w.slope * delay + rate * sent) * ts * size
     drift = w.slope * rate * ts * size
     spacing = 1 / (w.slope * ts * size * LINES)
     first_slots = np.arange(0, w.num_chirps, slots)
     after = np.minimum(first_slots + slots, w.num_chirps)
     middle = (first_slots + after - w.num_chirps) / 2 * w.slot_duration
     below = np.multiply.outer(middle, drift * LINES)
-    below += place * LINES
+    below += position * LINES
     np.floor(below, out=below)
     shown = [
         np.argsort(below[:, first:last], axis=1, kind="stable") + first
@@ -337,7 +339,7 @@ def below_noise_paths(
         sent * rate,
         (sent * accel - w.slope * rate**2) / 2,
         np.full(element.shape, np.abs(factor) * real, np.float32),
-        place,
+        position,
         drift,
         (extra / spacing).astype(np.float32),
         steering(path, delay / (ts * half)),
@@ -347,24 +349,24 @@ def below_noise_paths(
 
 
 @jit(fast=True, borrows=True)
-def turn_elements(steer, late, per_line):
-    """Turn the elements' phasors (of `BelowNoisePaths.steer`, phases over half a chirp instead of
-    lines) by what a path's delay `late`, in half chirps, does to the frequency that they see."""
+def shift_elements(steer, late, per_line):
+    """Multiply the elements' phasors (`BelowNoisePaths.steer`, with phases over half a chirp
+    instead of lines) by the phase of a path's delay `late` [half chirps], to first order."""
     for i in range(late.shape[0]):
         at = 48 * i
-        re, im, turn = load(steer, at), load(steer, at + 16), load(steer, at + 32)
-        angle = turn * splat(np.float32(late[i]))
+        re, im, phase_step = load(steer, at), load(steer, at + 16), load(steer, at + 32)
+        angle = phase_step * splat(np.float32(late[i]))
         store(steer, at, re + angle * im)
         store(steer, at + 16, im - angle * re)
-        store(steer, at + 32, turn * splat(np.float32(1 / per_line)))
+        store(steer, at + 32, phase_step * splat(np.float32(1 / per_line)))
 
 
 @jit(fast=True, borrows=True)
 def _shares(workspace, paths, first, last, antenna, segment):
     """The upper lines' shares of a group's paths, in the middle of each few chirps that an antenna
     sends."""
-    below, late, size = paths.below[segment], paths.late[antenna], paths.turn.shape[0]
-    for half in range(TOGETHER // _ACROSS):
+    below, late, size = paths.below[segment], paths.late[antenna], paths.phase_rate.shape[0]
+    for half in range(CHIRPS_PER_BATCH // _ACROSS):
         middle, count = 0.0, 0
         for c in range(_ACROSS * half, _ACROSS * half + _ACROSS):
             if workspace.antenna[c] == antenna:
@@ -372,8 +374,8 @@ def _shares(workspace, paths, first, last, antenna, segment):
                 count += 1
         middle /= max(count, 1)
         for n in range(first, last, LANES):
-            place = load(paths.place, n) + load(paths.drift, n) * splat(middle)
-            share = narrow(place * splat(float(LINES)) - load(below, n)) + load(late, n)
+            position = load(paths.position, n) + load(paths.drift, n) * splat(middle)
+            share = narrow(position * splat(float(LINES)) - load(below, n)) + load(late, n)
             store(workspace.share, half * size + n, share)
 
 
@@ -384,11 +386,11 @@ def _amplitudes(workspace, paths, first, last, antenna):
     for n in range(first, last, LANES):
         p, f, g, a = (
             load(phase, n),
-            load(paths.turn, n),
+            load(paths.phase_rate, n),
             load(paths.curvature, n),
             load(amplitude, n),
         )
-        for c in range(TOGETHER):
+        for c in range(CHIRPS_PER_BATCH):
             at = n // LANES * _Z + 2 * LANES * c
             if workspace.antenna[c] != antenna:
                 store(workspace.z, at, splat(np.float32(0)))
@@ -412,12 +414,12 @@ def _one(z, j, sr, si, ar, ai):
 def _weigh(workspace, antenna, w, buffer):
     """Where the data of the chirps that an antenna sends move all lines: by whole lines, and the
     weights of the `LINES` places within a grid step that are left."""
-    for c in range(TOGETHER):
+    for c in range(CHIRPS_PER_BATCH):
         if workspace.antenna[c] != antenna:
             continue
         moved = w.slope * w.step * buffer.size * LINES * workspace.times[c, 1]
         workspace.shift[c] = int(np.floor(moved))
-        r = narrow(load(workspace.place, 0) + splat((moved - np.floor(moved)) / LINES))
+        r = narrow(load(workspace.position, 0) + splat((moved - np.floor(moved)) / LINES))
         for j in range(TAPS):
             v = splat(buffer.poly[j])
             for d in range(1, TAPS + EXTRA + 1):
@@ -430,7 +432,7 @@ def _factors(workspace, count, antenna, w, buffer):
     """Factors of `count` lines in the chirps that an antenna sends."""
     to_beat = 1 / (LINES * w.step * buffer.size)
     low, high = workspace.lines[0] * to_beat, workspace.lines[count - 1] * to_beat
-    for c in range(TOGETHER):
+    for c in range(CHIRPS_PER_BATCH):
         if workspace.antenna[c] != antenna:
             continue
         data, sent = workspace.times[c, 1], workspace.sent[c]
@@ -454,7 +456,7 @@ def _sum(workspace, count, buffer, paths, order, chirps):
     the line after theirs is there when its turn comes. Unsigned indices are not checked for their
     sign."""
     steer, z, sums, shares = paths.steer, workspace.z, workspace.sums, workspace.share
-    size = paths.turn.shape[0]
+    size = paths.phase_rate.shape[0]
     for b in range(count):
         begin, end, line = workspace.begin[b], workspace.end[b], _LINE * b
         for first in range(0, chirps, _ACROSS):  # as often as before, which processors foresee
@@ -524,8 +526,8 @@ def _spread(grids, workspace, count, c, buffer, lane):
     zero = _NONE * load_part(workspace.sums, at)
     ar, ai, br, bi, cr, ci, dr, di = zero, zero, zero, zero, zero, zero, zero, zero
     for b in range(count):
-        place = int(workspace.lines[b]) + shift
-        steps = place // LINES - last
+        position = int(workspace.lines[b]) + shift
+        steps = position // LINES - last
         if steps > 0:
             to = base + row * ROW
             if steps == 1:
@@ -539,7 +541,7 @@ def _spread(grids, workspace, count, c, buffer, lane):
         x, y = workspace.factor[k + b], workspace.factor[k + _BLOCK + b]
         sr, si = load_part(workspace.sums, at), load_part(workspace.sums, at + 16)
         sr, si = x * sr - y * si, x * si + y * sr
-        j = c * TAPS * LANES + place % LINES
+        j = c * TAPS * LANES + position % LINES
         u, v = weights[j], weights[j + LANES]
         p, q = weights[j + 2 * LANES], weights[j + 3 * LANES]
         ar, ai, br, bi = ar + u * sr, ai + u * si, br + v * sr, bi + v * si
@@ -599,7 +601,7 @@ def add_below_noise(grids, paths, segment, chirps, t, w, buffer, workspace):
         stop = begin + end - first
         for antenna in range(paths.phase.shape[0]):
             sends = False
-            for c in range(TOGETHER):
+            for c in range(CHIRPS_PER_BATCH):
                 sends |= workspace.antenna[c] == antenna
             if not sends:
                 continue
@@ -613,7 +615,7 @@ def add_below_noise(grids, paths, segment, chirps, t, w, buffer, workspace):
                 count, i, line, pending = _gather(workspace, order, below, i, stop, line, pending)
                 _factors(workspace, count, antenna, w, buffer)
                 _sum(workspace, count, buffer, paths, order, chirps.shape[0])
-                for c in range(TOGETHER):
+                for c in range(CHIRPS_PER_BATCH):
                     for lane in range(0, LANES if workspace.antenna[c] == antenna else 0, PART):
                         _spread(grids, workspace, count, c, buffer, lane)
                 for at in range(0, _LINE, LANES):

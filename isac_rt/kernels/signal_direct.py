@@ -84,7 +84,7 @@ def passed(w, tau):
 
 
 @jit(fast=True, borrows=True)
-def _turn(out, at, cycles, amplitude):
+def _phasor(out, at, cycles, amplitude):
     """amplitude exp(j 2 pi cycles) of 16 float64: real parts to out[at:], imaginary ones to out[at
     + 16:]."""
     c, s = cos_sin_exact(cycles - floor(cycles + splat(0.5)))
@@ -102,15 +102,15 @@ def _tone(workspace, half, amplitude, phase, frequency, quadratic):
     X^2) exp(frequency i + quadratic i^2) (1 + j 4 pi quadratic X i), all phases reduced in float64;
     what is left out is the square of the last term, 1e-8 at 15 m/s.
     """
-    sums, starts, lane, places = workspace
-    within = load(places, 0)
-    _turn(lane, 0, within * (splat(frequency) + within * splat(quadratic)), 1.0 + 0.0j)
+    sums, starts, lane, offsets = workspace
+    within = load(offsets, 0)
+    _phasor(lane, 0, within * (splat(frequency) + within * splat(quadratic)), 1.0 + 0.0j)
     lr, li, offset = load(lane, 0), load(lane, 16), narrow(within)
     mr, mi = offset * lr, offset * li
     blocks, curvature = sums.shape[0] // 32, np.float32(4 * np.pi * quadratic)
     for first in range(0, blocks, LANES):
-        x = load(places, 16) + splat(first * LANES - half)
-        _turn(starts, 0, splat(phase) + x * (splat(frequency) + x * splat(quadratic)), amplitude)
+        x = load(offsets, 16) + splat(first * LANES - half)
+        _phasor(starts, 0, splat(phase) + x * (splat(frequency) + x * splat(quadratic)), amplitude)
         cross = narrow(x) * splat(curvature)
         store(starts, 32, splat(np.float32(0)) - cross * load(starts, 16))
         store(starts, 48, cross * load(starts, 0))
@@ -149,11 +149,11 @@ def flush(out, to, num_samples, sums, fresh):
 
 
 @jit(fast=True, borrows=True)
-def _turned(sums, turn):
+def _multiplied(sums, factor):
     """Multiply the sums of one chirp by as many complex factors, interleaved."""
-    for n in range(turn.shape[0] // 2):
+    for n in range(factor.shape[0] // 2):
         at = 32 * (n // LANES) + n % LANES
-        re, im, c, s = sums[at], sums[at + 16], turn[2 * n], turn[2 * n + 1]
+        re, im, c, s = sums[at], sums[at + 16], factor[2 * n], factor[2 * n + 1]
         sums[at], sums[at + 16] = re * c - im * s, re * s + im * c
 
 
@@ -164,7 +164,7 @@ class _Workspace(NamedTuple):
     sums: np.ndarray
     starts: np.ndarray
     lane: np.ndarray
-    places: np.ndarray
+    offsets: np.ndarray
 
 
 class OneByOne(NamedTuple):
@@ -179,12 +179,12 @@ class OneByOne(NamedTuple):
 def one_by_one(waveform: Any, tones: Any) -> OneByOne:
     """All that is received of some tones, for the kernels."""
     lanes = np.arange(LANES)
-    places = np.concatenate([lanes, lanes * LANES]) + (LANES - 1) / 2 * np.repeat(
+    offsets = np.concatenate([lanes, lanes * LANES]) + (LANES - 1) / 2 * np.repeat(
         [-1.0, 1.0], LANES
     )
     blocks = -(-waveform.num_samples // LANES)
     workspace = _Workspace(
-        aligned(2 * LANES * blocks), aligned(4 * LANES), aligned(2 * LANES), places
+        aligned(2 * LANES * blocks), aligned(4 * LANES), aligned(2 * LANES), offsets
     )
     path, offset = tones.sources(waveform)
     return OneByOne(path, offset, tones, workspace)
@@ -222,7 +222,7 @@ def sum_paths(alone, w, half, m, r, p):
 
 
 @jit(fast=True, borrows=True)
-def _direct(out, shape, w, alone, fresh, turn):
+def _direct(out, shape, w, alone, fresh, factor):
     """Add the paths to the samples of `shape`, or write them."""
     groups, num_rx, chirps, num_samples = shape
     half, sums = float(num_samples // 2), alone.workspace.sums
@@ -230,8 +230,8 @@ def _direct(out, shape, w, alone, fresh, turn):
         m, r, p = line // (num_rx * chirps), line // chirps % num_rx, line % chirps
         if sum_paths(alone, w, half, m, r, p) == 0 and not fresh:
             continue
-        if turn.shape[0]:
-            _turned(sums, turn[m * chirps + p])
+        if factor.shape[0]:
+            _multiplied(sums, factor[m * chirps + p])
         flush(out, 2 * num_samples * line, num_samples, sums, fresh)
 
 
@@ -241,7 +241,7 @@ def add_direct(
     tones: Any,
     *,
     fresh: bool = False,
-    turn: np.ndarray | None = None,
+    factor: np.ndarray | None = None,
 ) -> None:
     """Add paths one by one, every element with its own delay (wideband, spherical).
 
@@ -253,7 +253,7 @@ def add_direct(
     ----------
     samples : (M, L_rx, P, N) complex64, contiguous, added to
     fresh : write instead of adding, whatever `samples` held
-    turn : (M, P, N) complex64 by which the paths' samples are multiplied; None: not
+    factor : (M, P, N) complex64 by which the paths' samples are multiplied; None: not
     """
     alone = one_by_one(waveform, tones)
     if alone.path.size == 0:
@@ -262,6 +262,6 @@ def add_direct(
         return
     flat = samples.reshape(-1).view(np.float32)
     rows = np.zeros((0, 0), np.float32)
-    if turn is not None:
-        rows = turn.reshape(-1, turn.shape[2]).view(np.float32)
+    if factor is not None:
+        rows = factor.reshape(-1, factor.shape[2]).view(np.float32)
     _direct(flat, samples.shape, numbers(waveform), alone, fresh, rows)

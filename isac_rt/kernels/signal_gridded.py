@@ -1,20 +1,20 @@
 r"""IF samples of many paths through an oversampled grid of fast-time frequency (a non-uniform FFT
 per chirp).
 
-In each chirp every path is a tone of known start phase and frequency (float64). It is spread with a
-few weights on a grid of frequencies, all receive elements at once; one FFT and one division make
-the samples. Further sets of weights on the same grid points carry x and x^2 (x: time from the
-middle of the chirp), so that the quadratic phase of motion and the wideband delay of each receive
-element need no second transform:
+In a chirp a path is a tone of known start phase and frequency (float64). It is spread with a few
+weights on a grid of frequencies, for all receive elements at once; one FFT and a division by the
+transform of the weights give the samples. Two further sets of weights on the same grid points carry
+x and x^2 (x: time from mid-chirp), for the quadratic phase of motion and the wideband delay of each
+receive element, without a second transform:
 
 .. math::
 
     z\,e^{-j\theta_l\lambda}\,e^{jq(x^2-c)}\,e^{j\theta_l x} \approx z\,e^{-j\theta_l\lambda}\,(1 +
     j\theta_l (1 + jq\kappa) x + (jq - \theta_l^2/2)(x^2-c) - c\theta_l^2/2)
 
-with theta_l the turn of element l over half a chirp, lambda = tau/(T/2) (the array sees the
-frequency sent tau earlier), c the mean of x^2, and kappa = 4/15 (x (x^2 - c) is nearest to kappa
-x).
+with theta_l the phase of element l over half a chirp, lambda = tau/(T/2) (the array receives the
+frequency sent tau earlier), c the mean of x^2, and kappa = 4/15, the least-squares fit of kappa x
+to x (x^2 - c).
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from isac_rt.kernels.signal_below_noise import (
     add_below_noise,
     batches,
     below_noise_paths,
-    line_turn,
+    line_phase,
     make_workspace,
     no_paths,
     part_slots,
     plain_batches,
-    turn_elements,
+    shift_elements,
 )
 from isac_rt.kernels.signal_direct import OneByOne, flush, numbers, one_by_one, passed, sum_paths
 from isac_rt.kernels.signal_noise import add_stream_by, words_buffer
@@ -72,7 +72,7 @@ elements of the L (measured: tests/signal/test_gridding.py)."""
 # paths that no longer stay in the second-level cache beside the grid; they are read once for
 # several chirps
 _MANY = 4000
-_TOGETHER = 6
+_CHIRPS_PER_BATCH = 6
 _MARGIN = LANES  # rows beyond the grid
 _TILE = 2 * LANES * LANES  # floats of 16 complex samples of 16 channels
 _STEP = 3 * LANES  # floats between the weights of a grid point and those of the next
@@ -250,15 +250,15 @@ class _Workspace(NamedTuple):
 
     grid: np.ndarray
     work: np.ndarray
-    places: np.ndarray
+    cells: np.ndarray
     scratch: np.ndarray
     tile: np.ndarray
     words: np.ndarray
 
 
 @jit(fast=True, borrows=True)
-def _prepare(work, places, b, block, w, g, time, symbol, send, antenna):
-    """Prepare 16 paths: place on the grid to `places`; distance from the middle of the cell,
+def _prepare(work, cells, b, block, w, g, time, symbol, send, antenna):
+    """Prepare 16 paths: place on the grid to `cells`; distance from the middle of the cell,
     complex factor (less the filter's gain), quadratic term [rad] and lambda, 16 floats of each, to
     `work`."""
     f_c, slope, ts, u = w.carrier, w.slope, w.step, w.middle
@@ -279,10 +279,10 @@ def _prepare(work, places, b, block, w, g, time, symbol, send, antenna):
     sent = carrier - splat(slope) * element
     cycles = element * (carrier - splat(slope / 2) * element)
     frequency = sent * step + splat(slope * ts) * element
-    place = (frequency - floor(frequency)) * splat(size * _BELOW)
-    cell = floor(place)
-    store(places, 0, cell)
-    store(work, 0, narrow(place - cell) - splat(_HALF))
+    position = (frequency - floor(frequency)) * splat(size * _BELOW)
+    cell = floor(position)
+    store(cells, 0, cell)
+    store(work, 0, narrow(position - cell) - splat(_HALF))
     curvature = narrow(
         (sent * a + splat(slope) * step * (splat(ts) - splat(0.5) * step)) * splat(half * half)
     )
@@ -340,11 +340,11 @@ def _centred(steer, work, i, k):
 
 
 @jit(fast=True, borrows=True)
-def _spread(grid, base, places, scratch, count, taps, steer, k, work, centre):
+def _spread(grid, base, cells, scratch, count, taps, steer, k, work, centre):
     """Add `count` of 16 paths to `width` rows each of the grid that lies from float `base`, with
     every element's own delay: strengths of 1, j x and x^2 - c."""
     for i in range(count):
-        at = base + int(places[i]) * ROW
+        at = base + int(cells[i]) * ROW
         er, ei, theta, q = _centred(steer, work, i, k)
         minus = theta * theta * splat(-_HALF)
         gr, gi = minus * er - q * ei, minus * ei + q * er
@@ -413,7 +413,7 @@ def _emit(out, at, stride, channels, num_samples, tile):
 def _chirps(out, shape, first_channel, w, g, contributions, t, noise, workspace):
     """Synthesise all chirps for up to 16 receive elements, in this order: spread, transform, divide
     and add paths one by one and noise, emit, one batch of chirps after the other."""
-    grid, work, places, scratch, tile, words = workspace
+    grid, work, cells, scratch, tile, words = workspace
     power, key0, key1 = noise
     b, steer, faint, alone = contributions
     groups, num_rx, num_chirps, num_samples = shape
@@ -439,12 +439,12 @@ def _chirps(out, shape, first_channel, w, g, contributions, t, noise, workspace)
                 if least > cut or most < -sidelobe:
                     continue
                 send, antenna = t.send[q, source, p], t.antenna[q, source, p]
-                _prepare(work, places, b, i, w, g, time, delay, send, antenna)
+                _prepare(work, cells, b, i, w, g, time, delay, send, antenna)
                 if b.blocks[i, 3] or least < 0 or most > top:
                     _gate(work, b, i, w, time, delay)
                 to, k = c * stride, i * 16 * 48
                 _weigh(work, scratch, g.poly, g.taps)
-                _spread(grid, to, places, scratch, used, g.taps, steer, k, work, centre)
+                _spread(grid, to, cells, scratch, used, g.taps, steer, k, work, centre)
         if faint.paths.groups.shape[0]:
             add_below_noise(grid, faint.paths, segment, chirps, t, w, faint.buffer, faint.workspace)
         for c in range(count):
@@ -467,7 +467,7 @@ def _chirps(out, shape, first_channel, w, g, contributions, t, noise, workspace)
 
 
 @jit(fast=True, borrows=True)
-def _steer(out, path, rx, first, frequency, slope, turn, delay):
+def _steer(out, path, rx, first, frequency, slope, half_chirp_phase, delay):
     """`_steering` of the listed paths to the flat `out`; `delay`: room for 16 float64, zero from
     the last element on."""
     rx_delay, gain = rx
@@ -483,7 +483,7 @@ def _steer(out, path, rx, first, frequency, slope, turn, delay):
         for r in range(count if gain.shape[0] else 0):
             own = gain[path[i], first + r] * complex(out[at + r], out[at + LANES + r])
             out[at + r], out[at + LANES + r] = own.real, own.imag
-        store(out, at + 2 * LANES, narrow(late * splat(turn)))
+        store(out, at + 2 * LANES, narrow(late * splat(half_chirp_phase)))
 
 
 def _steering(
@@ -493,8 +493,8 @@ def _steering(
     `first` on at mid-window (real, imaginary) and their turn over half a chirp [rad]."""
     w, out = waveform, unset(len(path) * 3 * LANES)
     middle = w.carrier_frequency + w.slope * w.fast_time[w.num_samples // 2]
-    turn = 2 * np.pi * w.slope * w.sample_interval * (w.num_samples // 2)
-    _steer(out, path, rx, first, middle, w.slope, turn, np.zeros(LANES))
+    half_chirp_phase = 2 * np.pi * w.slope * w.sample_interval * (w.num_samples // 2)
+    _steer(out, path, rx, first, middle, w.slope, half_chirp_phase, np.zeros(LANES))
     return out
 
 
@@ -558,14 +558,14 @@ def make_gridded(
     w, t, shape = waveform, tones, samples.shape
     path, offset = t.sources(w)
     reach = w.frame_duration / 2
-    apart = (faint & (t.begin <= -reach) & (t.end >= reach))[path]
+    faint_path = (faint & (t.begin <= -reach) & (t.end >= reach))[path]
     kernel = weights(w.num_samples, OVERSAMPLING, WIDTH, TAPS)
-    b = _blocks(w, t, path[~apart], offset[~apart])
+    b = _blocks(w, t, path[~faint_path], offset[~faint_path])
     count = w.num_groups * w.num_chirps
-    weak, order = (path[apart], offset[apart]), plain_batches(count, 1)
+    weak, order = (path[faint_path], offset[faint_path]), plain_batches(count, 1)
     if b.path.size > _MANY:
-        order = plain_batches(count, _TOGETHER)
-    if apart.any():
+        order = plain_batches(count, _CHIRPS_PER_BATCH)
+    if faint_path.any():
         slots = part_slots(w, t.rate[weak[0]], kernel.grid)
         order = batches(t.antenna[0], slots)
     g = _Grid(
@@ -580,7 +580,7 @@ def make_gridded(
     stride = (kernel.grid + _MARGIN) * ROW
     buffer = Buffer(
         kernel.grid,
-        line_turn(kernel.grid, g.half) ** 2 * g.centre / 2,
+        line_phase(kernel.grid, g.half) ** 2 * g.centre / 2,
         stride,
         (WIDTH - TAPS) // 2 * ROW,
         kernel.faint.ravel(),
@@ -595,8 +595,8 @@ def make_gridded(
     for first in range(0, shape[1], LANES):
         steer = _steering(w, rx, b.path, first)
         paths = no_paths(t.tx_delay.shape[1])
-        if apart.any():
-            steering = partial(_turned_steering, w, rx, first, kernel.grid)
+        if faint_path.any():
+            steering = partial(_shifted_steering, w, rx, first, kernel.grid)
             paths = below_noise_paths(w, t, weak, slots, kernel.grid, g.centre, steering)
         contributions = _Contributions(
             b, steer, _Faint(paths, buffer, make_workspace(paths)), one_after_the_other
@@ -604,7 +604,7 @@ def make_gridded(
         _chirps(flat, shape, first, shared, g, contributions, t, noise, workspace)
 
 
-def _turned_steering(
+def _shifted_steering(
     waveform: Any,
     rx: tuple[np.ndarray, np.ndarray],
     first: int,
@@ -615,5 +615,5 @@ def _turned_steering(
     """`_steering` for `BelowNoisePaths`: with what the paths' own delays, in half chirps, do to the
     frequency that the elements see."""
     out = _steering(waveform, rx, path, first)
-    turn_elements(out, late, line_turn(size, waveform.num_samples // 2))
+    shift_elements(out, late, line_phase(size, waveform.num_samples // 2))
     return out

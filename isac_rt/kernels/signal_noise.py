@@ -131,12 +131,12 @@ def _cos_sin(word):
     q = x * x
     s = x * (_SIN[0] + q * (_SIN[1] + q * (_SIN[2] + q * (_SIN[3] + q * _SIN[4]))))
     c = _COS[0] + q * (_COS[1] + q * (_COS[2] + q * (_COS[3] + q * _COS[4])))
-    turn = np.int32(np.int32(quarter) & np.int32(3))
-    swap = np.int32(turn & np.int32(1))
+    quadrant = np.int32(np.int32(quarter) & np.int32(3))
+    swap = np.int32(quadrant & np.int32(1))
     cosine, sine = (s if swap else c), (c if swap else s)
-    if turn == 1 or turn == 2:
+    if quadrant == 1 or quadrant == 2:
         cosine = -cosine
-    if turn >= 2:
+    if quadrant >= 2:
         sine = -sine
     return cosine, sine
 

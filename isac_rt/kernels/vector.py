@@ -272,18 +272,18 @@ def transpose(typingctx, array, index):
 
         def square(row, column):
             starts = [LANES * (row + i) + column for i in range(PART)]
-            places = [builder.add(args[1], ir.Constant(args[1].type, start)) for start in starts]
-            return [_address(context, builder, kind, args[0], at, form) for at in places]
+            addresses = [builder.add(args[1], ir.Constant(args[1].type, start)) for start in starts]
+            return [_address(context, builder, kind, args[0], at, form) for at in addresses]
 
         for row in range(0, LANES, PART):
             for column in range(0, row + 1, PART):
                 squares = [square(row, column), square(column, row)][: 1 + (row > column)]
                 turned = [
-                    _transposed(builder, [builder.load(at, align=4) for at in places])
-                    for places in squares
+                    _transposed(builder, [builder.load(at, align=4) for at in addresses])
+                    for addresses in squares
                 ]
-                for places, rows in zip(reversed(squares), turned, strict=True):
-                    for at, value in zip(places, rows, strict=True):
+                for addresses, rows in zip(reversed(squares), turned, strict=True):
+                    for at, value in zip(addresses, rows, strict=True):
                         builder.store(value, at, align=4)
         return context.get_dummy_value()
 

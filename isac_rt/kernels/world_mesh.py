@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from isac_rt.kernels.jit import jit
 
-TOGETHER = 64
+FACES_PER_BATCH = 64
 """Faces that are asked for a plane at once: most are nowhere near it."""
 
 
@@ -27,8 +27,8 @@ def group_planes(corners: NDArray, normals: NDArray, offsets: NDArray, tolerance
         num_open -= 1
         nx, ny, nz = normals[seed]
         d = offsets[seed]
-        for start in range(0, left.size, TOGETHER):
-            some = slice(start, start + TOGETHER)
+        for start in range(0, left.size, FACES_PER_BATCH):
+            some = slice(start, start + FACES_PER_BATCH)
             if not _count_near(x[some], y[some], z[some], nx, ny, nz, d, 2 * tolerance):
                 continue
             for face in left[some]:

@@ -114,9 +114,9 @@ class FreeSpace:
 
     def _echo(self, name: str, poses: dict[str, Pose], there: Legs, back: Legs) -> float:
         """Amplitude of one UAV's echo by the radar equation, without the elements."""
-        body = poses[name]
+        uav = poses[name]
         section = self.sections[name].square_metres(
-            body.to_body(there.arrival), body.to_body(back.arrival)
+            uav.to_body(there.arrival), uav.to_body(back.arrival)
         )
         return float(radar_amplitude(self.wavelength, section, there.length, back.length)[0])
 

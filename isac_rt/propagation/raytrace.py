@@ -52,7 +52,7 @@ from isac_rt.propagation.legs.geometry import (
     plane_of_each_face,
     unfold,
 )
-from isac_rt.propagation.legs.images import ASIDE, SLACK, STRETCH, Images
+from isac_rt.propagation.legs.images import PROBES_M, SLACK, STRETCH, Images
 from isac_rt.propagation.legs.legset import LegSet, TracedLegs, leg_set
 from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.model import Census, Traced
@@ -215,10 +215,10 @@ class RayTracer:
         )
         for name in [*scene.transmitters, *scene.receivers]:
             scene.remove(name)
-        for name, place in sources.items():
-            scene.add(rt.Transmitter(f"tx-{name}", position=mi.Point3f(*place.tolist())))
-        for name, place in sinks.items():
-            scene.add(rt.Receiver(f"rx-{name}", position=mi.Point3f(*place.tolist())))
+        for name, position in sources.items():
+            scene.add(rt.Transmitter(f"tx-{name}", position=mi.Point3f(*position.tolist())))
+        for name, position in sinks.items():
+            scene.add(rt.Receiver(f"rx-{name}", position=mi.Point3f(*position.tolist())))
         room = min((samples_per_src * max_depth + 1) * len(sinks), MOST_PATHS)
         found = self._solver(
             scene,
@@ -245,9 +245,9 @@ class RayTracer:
         sinks = {name: local[name].position for name in self._free.names}
         beside = (
             {
-                f"{name}-{k}": place + step
-                for name, place in sources.items()
-                for k, step in enumerate(ASIDE)
+                f"{name}-{k}": position + step
+                for name, position in sources.items()
+                for k, step in enumerate(PROBES_M)
             }
             if depth > 1
             else {}
@@ -266,8 +266,8 @@ class RayTracer:
                 which = np.flatnonzero(valid[i, j])
                 rows, loose = np.full(which.size, i), np.zeros(which.size)
                 if start == end and beside:
-                    first = len(sinks) + len(ASIDE) * j
-                    steps, found_beside = np.nonzero(corner[first : first + len(ASIDE), j])
+                    first = len(sinks) + len(PROBES_M) * j
+                    steps, found_beside = np.nonzero(corner[first : first + len(PROBES_M), j])
                     rows, which = np.append(rows, first + steps), np.append(which, found_beside)
                     loose = np.append(loose, np.full(steps.size, SLACK))
                 at = rows, j, which
@@ -316,10 +316,10 @@ class RayTracer:
                 # a terminal's path to itself is its leakage, which is not the ray tracer's
                 continue
             legs = unfold(self._normals[chain], self._offsets[chain], start, end)
-            apart = np.linalg.norm(legs.points - points[which][:, :count], axis=-1).max(
+            distance = np.linalg.norm(legs.points - points[which][:, :count], axis=-1).max(
                 axis=1, initial=0.0
             )
-            good = apart < STRETCH * legs.length + slack[which]
+            good = distance < STRETCH * legs.length + slack[which]
             # what stands beside may well go astray at grazing angles
             dropped += int((~good & (slack[which] == 0)).sum())
             planes = edges_in_any_order(self._city.plane_of_face[chain], legs.points)
@@ -383,12 +383,12 @@ class RayTracer:
         allowed."""
         most = self._propagation.max_bounces if self._propagation.ghosts else 0
         sent, received, sections, numbers = [], [], [], []
-        for name, body in discs.items():
+        for name, pose in discs.items():
             to, on = legs[Link(state.link.tx, name)], legs[Link(state.link.rx, name)]
             i, j = np.divmod(np.arange(len(to) * len(on)), max(len(on), 1))
             allowed = np.flatnonzero(to.bounces[i] + on.bounces[j] <= most)
             to, on = to.select(i[allowed]), on.select(j[allowed])
-            aspects = body.to_body(to.legs.arrival), body.to_body(on.legs.arrival)
+            aspects = pose.to_body(to.legs.arrival), pose.to_body(on.legs.arrival)
             sections.append(self._free.sections[name].square_metres(*aspects))
             numbers.append(np.full(len(to), self._free.names.index(name)))
             sent.append(to)
@@ -398,8 +398,8 @@ class RayTracer:
         scatter = np.sqrt(4 * np.pi * np.concatenate(sections)) / self._free.wavelength
         scatter_paths = ScatterPaths.over(a, b)
         elements = state.elements(self._free.antennas, scatter_paths)
-        places = [body.position for body in discs.values()]
-        middle = np.repeat(places, [len(to) for to in sent], axis=0)[:, None]
+        positions = [pose.position for pose in discs.values()]
+        middle = np.repeat(positions, [len(to) for to in sent], axis=0)[:, None]
         chain = [there.faces, np.full((len(there), 1), -1), back.faces[:, ::-1]]
         return state.paths(
             scatter_paths,

@@ -1,4 +1,4 @@
-"""DCA-SPE: the active terminal takes its own data out of its echoes and senses."""
+"""DCA-SPE: the active terminal removes its data from its echoes and detects targets."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from isac_rt.receive.types import NO_HINTS, ExpectedClutter, Hints, Reception
 
 @dataclass(frozen=True)
 class ActiveReceiver:
-    """The active terminal's chain: data out, clutter filter, detector and estimator, refiner."""
+    """Processing of the active terminal: data removal, clutter filter, detection, estimation,
+    refinement."""
 
     antennas: Antennas
     settings: Receivers
@@ -31,7 +32,7 @@ class ActiveReceiver:
 
     @classmethod
     def of(cls, antennas: Antennas, settings: Receivers) -> ActiveReceiver:
-        """The chain that the settings name."""
+        """Build the receiver of the settings."""
         chain = filter_of(settings), detector_of(settings), refiner_of(settings)
         return cls(antennas, settings, *chain)
 
@@ -78,16 +79,16 @@ def receive_active(
     clutter: ExpectedClutter | None = None,
     maps: bool = False,
 ) -> Reception:
-    """Range, velocity and direction of what the transmitter's own echoes show.
+    """Estimate range, velocity and direction of the echoes of the terminal's own transmission.
 
     Parameters
     ----------
     cube : IFCube, received by the terminal that sent `payload`
-    payload : what the terminal has sent
+    payload : transmitted data
     antennas : of both ends
     settings : Receivers
-    clutter : what the city is expected to return, for `clutter_detector: angle_doppler`
-    maps : also return pictures
+    clutter : expected clutter of the city, for `clutter_detector: angle_doppler`
+    maps : also return range-Doppler maps
 
     Returns
     -------

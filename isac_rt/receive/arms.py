@@ -20,12 +20,12 @@ class Channels:
     Attributes
     ----------
     tx, rx : (L,) antennas
-    places : (L, 3) by which their phases tell the direction, in the body frame [m]
+    positions : (L, 3) by which their phases tell the direction, in the body frame [m]
     """
 
     tx: np.ndarray
     rx: np.ndarray
-    places: np.ndarray
+    positions: np.ndarray
 
     def __len__(self) -> int:
         return self.tx.size
@@ -33,7 +33,7 @@ class Channels:
     def steering(self, cosines: np.ndarray, known: Known) -> np.ndarray:
         """(K, L) exp(-j k v.u) of paths from body directions (K, 3), at the frequency of the
         window's middle."""
-        return np.exp(-1j * known.wavenumber * (cosines @ self.places.T))
+        return np.exp(-1j * known.wavenumber * (cosines @ self.positions.T))
 
 
 @lru_cache(maxsize=32)

@@ -1,9 +1,13 @@
 """Constant-false-alarm-rate detection on accumulated maps, and the choice of peaks.
 
-A cell of an accumulated noise map is the mean of L exponentials, a Gamma(L) variable; a training
-mean of n independent cells is Gamma(L n). The greatest-of rule takes the larger of the means before
-and behind the cell in range, which holds the rate at clutter edges. The factor follows from these
-laws by quadrature, not from the large-number limit.
+A noise cell of a map that averages L channels is Gamma(L)/L; the mean of n independent training
+cells is Gamma(L n)/(L n). Greatest-of CFAR (Richards) takes the larger of the means before and
+behind the cell in range, which holds the false-alarm rate at clutter edges. With F the distribution
+of that larger mean z, the factor k solves
+
+    P_fa = integral of P(cell > k z) dF(z) = integral of L k g(L k z) F(z) dz,                 (1)
+
+g the density of Gamma(L); it is integrated numerically.
 """
 
 from __future__ import annotations
@@ -24,30 +28,30 @@ HANN_CORRELATION = ((2 / 3) ** 2, (1 / 6) ** 2)
 QUADRATURE_POINTS = 4001
 
 ROUNDING = 1e-16
-"""The least background, relative to the strongest cell: complex64 transforms leave -170 dB of it a
-quarter and half the range away."""
+"""Least background relative to the strongest cell: rounding of complex64 transforms leaves -170 dB
+of it at a quarter and half of the range axis."""
 
 STRONG, MAX_STRONG = 1e3, 8
-"""Peaks this far over the median cell, and at most so many, are kept out of the training of the
-cells around them."""
+"""Least power over the median cell, and largest number, of peaks whose lobes are no training
+cells."""
 DEEPEST_LOBE = 1e-8
-"""Lobes are followed down to this share of their peak, 15 cells out; without noise they would fill
-the map."""
+"""Least power of a lobe relative to its peak, reached 15 cells out: without noise the lobes would
+fill the map."""
 LOBE_MARGIN = 4.0
-"""Power over the bound of a stronger path's sidelobes from which on a peak is one."""
+"""Least power of a peak over the bound of a stronger path's sidelobes."""
 LEAST_KEPT = 0.25
-"""Share of a training block that must be left for its mean to count."""
+"""Least share of a training block's cells for its mean to be used."""
 
 
 @dataclass(frozen=True)
 class CfarRule:
-    """When a cell stands out of its surroundings.
+    """Greatest-of CFAR with its training and guard cells.
 
     Attributes
     ----------
-    rate : false alarms of one cell
+    rate : false-alarm probability of one cell
     guard, training : (range, Doppler) cells on each side
-    looks : channels whose powers are averaged in the map
+    looks : L, channels whose powers are averaged in the map
 
     Examples
     --------
@@ -64,21 +68,21 @@ class CfarRule:
 
     @classmethod
     def of(cls, settings: Receivers, looks: int) -> CfarRule:
-        """The rule that the settings state, for a map of so many looks."""
+        """Build the rule of the settings for a map of `looks` channels."""
         s = settings
         return cls(s.false_alarm_rate, s.guard_cells, s.training_cells, looks)
 
     @property
     def threshold(self) -> float:
-        """Factor on the background of a Hann-windowed map, away from the ends of the range axis."""
+        """Factor k of (1) for a Hann-windowed map, away from the ends of the range axis."""
         return _factor(self, self.training[0], self.training[0])
 
     def factors(self, rows: int) -> np.ndarray:
-        """(rows,) factors on the background of a Hann-windowed map of so many range rows."""
+        """Return the factors k (rows,) of a Hann-windowed map."""
         return _factors(self, rows)
 
     def detect(self, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cells above the threshold, and the background of every cell.
+        """Compare each cell with its threshold, k times the background.
 
         Parameters
         ----------
@@ -93,7 +97,7 @@ class CfarRule:
         return power > self.factors(len(power))[:, None] * level, level
 
     def ratio(self, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Power over the threshold of `detect`, and the background."""
+        """Return power over threshold, and background (`detect`)."""
         level = self.detect(power)[1]
         return power / (self.factors(len(power))[:, None] * level), level
 
@@ -117,9 +121,9 @@ class CfarRule:
         return power > factor[:, None] * level
 
     def background(self, power: np.ndarray, keep: np.ndarray) -> np.ndarray:
-        """The greater of the means over the kept cells of the training blocks before and behind
-        each cell in range; Doppler wraps. Where one holds too few cells the other, infinite where
-        both do."""
+        """Return the greater of the means of the training cells before and behind each cell in
+        range, of the cells to `keep`; Doppler wraps. A block with too few cells is left out;
+        infinite without any."""
         out = np.empty(power.shape)
         half = self.guard[1] + self.training[1]
         sides = self.side_rows(len(power))
@@ -129,8 +133,8 @@ class CfarRule:
         return out
 
     def side_rows(self, rows: int) -> np.ndarray:
-        """(rows, 2) training rows before and behind each row; a side with less than half of them is
-        not used."""
+        """Return the training rows (rows, 2) before and behind each row; 0 for a side with less
+        than half of them."""
         index, guard, training = np.arange(rows), self.guard[0], self.training[0]
         count = np.clip(np.stack([index - guard, rows - 1 - guard - index], axis=1), 0, training)
         return np.where(count >= max(training // 2, 1), count, 0)
@@ -143,8 +147,8 @@ class CfarRule:
 
 @lru_cache(maxsize=4096)
 def _factor(rule: CfarRule, before: int, behind: int) -> float:
-    """`greatest_of_factor` of training blocks of so many rows: windowed neighbours count for less
-    than one each. Infinite where there is no training row."""
+    """Return `greatest_of_factor` for training blocks of `before` and `behind` rows, with the
+    independent cells of Hann-windowed neighbours; infinite without a training row."""
     if before == behind == 0:
         return np.inf
     across = independent_cells(2 * (rule.guard[1] + rule.training[1]) + 1)
@@ -164,7 +168,7 @@ def _factors(rule: CfarRule, rows: int) -> np.ndarray:
 def greatest_of_factor(
     false_alarm_rate: float, looks: float, before: float, behind: float
 ) -> float:
-    """Factor on the greater of two training means that gives the false-alarm rate.
+    """Solve (1) for the factor k on the greater of two training means.
 
     Parameters
     ----------
@@ -173,6 +177,7 @@ def greatest_of_factor(
     before, behind : independent training cells on each side (may be fractions); 0 where a side is
         missing
     """
+    # z: range in which the greater mean lies; F(z): product of both distributions
     sides = np.array([looks * n for n in (before, behind) if n > 0])  # shapes of Gamma means
     low = (special.gammaincinv(sides, 1e-12) / sides).min()
     high = (special.gammainccinv(sides, 1e-14) / sides).max()
@@ -180,7 +185,7 @@ def greatest_of_factor(
     cumulative = np.prod([special.gammainc(shape, shape * z) for shape in sides], axis=0)
 
     def excess(factor: float) -> float:
-        # by parts: the density of the greater mean against the cell's tail
+        # (1) on the grid of z; beyond it F = 1, the tail of the cell
         x = looks * factor * z
         density = np.exp(special.xlogy(looks - 1, x) - x - special.gammaln(looks))
         tail = special.gammaincc(looks, x[-1])
@@ -200,14 +205,17 @@ def fill_background(
     least: float,
     out: np.ndarray,
 ) -> None:
-    """Fill the background of each cell (`CfarRule.background`) of `power` (rows, P) from the cells
-    to `keep`, in blocks of `sides` rows (rows, 2) beyond the `guard` and `half` bins on each side;
-    `least` share of a block must be kept."""
+    """Fill in the background (`CfarRule.background`) of each cell of `power` (rows, P).
+
+    Training blocks have `sides` rows (rows, 2) beyond `guard` rows, and `half` bins on each side;
+    a block counts if the cells to `keep` are at least a share `least` of it.
+    """
     row, wide = np.arange(len(power)), 2 * half + 1
+    # sums over the bins about each cell, of powers and of kept cells; then cumulated over rows
     bins = np.arange(-half, power.shape[1] + half) % power.shape[1]
     kept = np.stack([np.where(keep, power, 0.0), keep]).astype(float)[..., bins]
     about = np.lib.stride_tricks.sliding_window_view(kept, wide, axis=2).sum(axis=3)
-    sums = np.pad(np.cumsum(about, axis=1), ((0, 0), (1, 0), (0, 0)))  # of the first 0, 1, ... rows
+    sums = np.pad(np.cumsum(about, axis=1), ((0, 0), (1, 0), (0, 0)))
     before, behind = sides.T
     out[:] = -np.inf
     for first, rows in ((row - guard - before, before), (row + guard + 1, behind)):
@@ -219,10 +227,10 @@ def fill_background(
 
 
 def strong_lobes(power: np.ndarray) -> np.ndarray:
-    """Cells that the lobes of the strongest peaks of a Hann-windowed map reach, (rows, P) bool.
+    """Mark the cells (rows, P) in which lobes of the strongest peaks exceed the median power.
 
-    A line of sight 60 dB over the noise would otherwise raise the background of every target within
-    the training block. A row is allowed for migration.
+    A line of sight 60 dB over the noise would otherwise raise the background of all targets within
+    its training block. One row is added for range migration.
     """
     noise = float(np.median(power))
     rows, bins = peaks(power, power > STRONG * noise, (8, 8))
@@ -238,8 +246,8 @@ def strong_lobes(power: np.ndarray) -> np.ndarray:
 
 
 def independent_cells(count: int) -> float:
-    """Independent cells whose mean scatters like that of `count` neighbours along a Hann-windowed
-    axis."""
+    """Return the number of independent cells whose mean has the variance of that of `count`
+    neighbours on a Hann-windowed axis: n^2 / (n + 2 sum of (n - d) rho_d)."""
     pairs = sum(max(count - d, 0) * c for d, c in enumerate(HANN_CORRELATION, start=1))
     return count**2 / (count + 2 * pairs) if count else 0.0
 
@@ -247,8 +255,8 @@ def independent_cells(count: int) -> float:
 def peaks(
     power: np.ndarray, above: np.ndarray, reach: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cells above the threshold that are the largest within `reach` (range, Doppler); Doppler
-    wraps. Strongest first."""
+    """Return the cells above the threshold that are the largest within `reach` (range, Doppler)
+    cells, strongest first; Doppler wraps."""
     rows, bins = np.nonzero(above)
     near = (np.arange(-r, r + 1) for r in reach)
     along, across = (at[:, None] + n for at, n in zip((rows, bins), near, strict=True))
@@ -262,7 +270,7 @@ def peaks(
 def strongest_peaks(
     power: np.ndarray, above: np.ndarray, settings: Receivers, floor: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(row, bin) of the peaks that are no sidelobes of a stronger one (`without_sidelobes`), at
+    """Return row and bin of peaks that are no sidelobes of a stronger one (`without_sidelobes`), at
     most `max_detections`."""
     rows, bins = peaks(power, above, (1, 1))
     keep = np.flatnonzero(without_sidelobes(rows, bins, power, power.shape[1], floor))[
@@ -272,14 +280,13 @@ def strongest_peaks(
 
 
 def first_row(settings: Receivers, range_cell: float) -> int:
-    """Row of a map in which the search begins; `range_cell` in metres."""
+    """Return the row of `min_range_m`, where the search begins; `range_cell` [m]."""
     return int(np.ceil(settings.min_range_m / range_cell))
 
 
 def hann_envelope(distance: np.ndarray) -> np.ndarray:
-    """Upper bound of a Hann-windowed tone's power at a distance in cells, relative to its peak: 1
-    within the main lobe, then 1/(pi^2 d^2 (1 - d^2)^2) for the peaks of the sidelobes (of the
-    amplitude sinc(d)/(1 - d^2))."""
+    """Return an upper bound of a Hann-windowed tone's power at `distance` [cells], over its peak: 1
+    in the main lobe, then the envelope 1/(pi d (1 - d^2))^2 of (sinc(d)/(1 - d^2))^2."""
     d = np.maximum(np.abs(distance), 2.0)
     return np.where(np.abs(distance) < 2.0, 1.0, 1.0 / (np.pi * d * (d * d - 1)) ** 2)
 
@@ -292,12 +299,12 @@ def without_sidelobes(
     floor: float,
     margin: float = LOBE_MARGIN,
 ) -> np.ndarray:
-    """Mark the peaks (strongest first) that are more than the sidelobes of a stronger one.
+    """Mark the peaks (strongest first) that are no sidelobes of a stronger one.
 
     Parameters
     ----------
-    floor : share of a path's power that may lie in any Doppler bin of its range row
-    margin : power factor above the bound
+    floor : sidelobe level in any Doppler bin of a path's range row, over its peak
+    margin : least power over the bound
     """
     keep, values = np.ones(rows.size, bool), power[rows, bins]
     for i in range(1, rows.size):
@@ -308,8 +315,8 @@ def without_sidelobes(
 
 
 def leaked(rows: np.ndarray, bins: np.ndarray, num_bins: int, floor: float) -> np.ndarray:
-    """Share of a path's power that may lie so many rows and bins from its cell: of its lobes, and
-    `floor` in any bin of its rows."""
+    """Return the bound of a path's power at a distance of rows and bins, over its peak: Hann's
+    lobes, and `floor` in any Doppler bin."""
     bins = np.abs(bins)
     bins = np.minimum(bins, num_bins - bins)
     return hann_envelope(rows) * (hann_envelope(bins) + floor)

@@ -1,4 +1,4 @@
-"""The paper's clutter filter: find consecutive occupied range cells, then filter what lies in them.
+"""The paper's clutter filter: find consecutive occupied range cells, then filter them.
 
 The paper (section V.A) says no more than that. Here a cell is occupied if its power exceeds the
 median over all cells, which most of the noise-only cells share, by `occupied_factor`; gaps of up to
@@ -35,16 +35,16 @@ LEAST_FACTOR = 2.0
 
 @dataclass(frozen=True)
 class ClutterFilter:
-    """The filter, of range cells in runs of at least `least` occupied ones; None: of every cell at
-    the AT, of none at a PT, whose line of sight may stand still too."""
+    """Clutter filter of range cells in runs of at least `least` occupied ones; None: of all cells
+    at the AT, of none at a PT, whose line of sight may be static."""
 
     least: int | None
 
     def clean(
         self, spectra: np.ndarray, schedule: Schedule, codes: np.ndarray | None = None
     ) -> None:
-        """Take what stands still out of the AT's spectra, in place; `codes` (L_tx, P) are those of
-        antennas that send at once, None where they take turns."""
+        """Remove static echoes from the AT's spectra, in place; `codes` (L_tx, P): of antennas that
+        send at once; None: they send in turn."""
         if codes is not None:
             spectra -= (spectra @ codes.conj().T.astype(np.complex64)) @ (
                 codes / codes.shape[1]
@@ -54,14 +54,14 @@ class ClutterFilter:
 
 
 def occupied_factor(looks: float) -> float:
-    """Power over the median of noise, a mean of `looks` exponentials, from which on a cell is
-    occupied; at least 3 dB."""
+    """Return the least power of an occupied cell over the median of noise, a mean of `looks`
+    exponentials; at least 3 dB."""
     rare, median = special.gammainccinv(looks, FALSE_RATE), special.gammaincinv(looks, 0.5)
     return max(float(rare / median), LEAST_FACTOR)
 
 
 def runs(power: np.ndarray, looks: float, least: int) -> np.ndarray:
-    """Range cells in runs of at least `least` occupied ones, with a margin.
+    """Mark the range cells in runs of at least `least` occupied ones, with a margin.
 
     Parameters
     ----------
@@ -81,8 +81,8 @@ def runs(power: np.ndarray, looks: float, least: int) -> np.ndarray:
 def _in_runs(occupied: np.ndarray, least: int) -> np.ndarray:
     """Mark the cells of lines that lie in runs of at least `least` occupied ones, gaps closed, with
     a margin."""
-    apart = max(GAP, 2 * MARGIN) + 1  # empty cells between the lines keep their runs apart
-    wide = np.pad(occupied, ((0, 0), (MARGIN, apart)))
+    gap = max(GAP, 2 * MARGIN) + 1  # empty cells between the lines keep their runs apart
+    wide = np.pad(occupied, ((0, 0), (MARGIN, gap)))
     at = np.flatnonzero(wide)
     breaks = np.flatnonzero(np.diff(at) > GAP + 1)
     first, last = at[np.append(0, breaks + 1)[: at.size]], at[np.append(breaks, -1)[: at.size]]
@@ -95,8 +95,8 @@ def _in_runs(occupied: np.ndarray, least: int) -> np.ndarray:
 
 
 def remove_static(spectra: np.ndarray, schedule: Schedule, least: int | None) -> np.ndarray:
-    """Subtract in place, from every range cell in a run, the mean over the chirps of each antenna
-    and group.
+    """Subtract in place, in range cells of runs, the mean over the chirps of each antenna and
+    group.
 
     Parameters
     ----------
@@ -124,13 +124,13 @@ def remove_static(spectra: np.ndarray, schedule: Schedule, least: int | None) ->
     return rows
 
 
-def chirp_runs(samples: np.ndarray, turn: np.ndarray, least: int) -> np.ndarray:
-    """Cells of each chirp that lie in a run, before any data are known.
+def chirp_runs(samples: np.ndarray, derotation: np.ndarray, least: int) -> np.ndarray:
+    """Mark the cells of each chirp in a run, before data decisions.
 
     Parameters
     ----------
     samples : (L_rx, P, N) of one group
-    turn : (P, N) by which the decision derotates them
+    derotation : (P, N) by which the decision derotates them
 
     Returns
     -------
@@ -139,5 +139,5 @@ def chirp_runs(samples: np.ndarray, turn: np.ndarray, least: int) -> np.ndarray:
     num_rx, num_chirps = samples.shape[:2]
     power = np.zeros(samples.shape[1:], np.float32)
     none = np.zeros(0, int), np.empty((num_rx, 0, num_chirps), np.complex64)
-    transform(samples, turn, *none, tapered=power)
+    transform(samples, derotation, *none, tapered=power)
     return runs(power / num_rx, num_rx, least)

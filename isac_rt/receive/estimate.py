@@ -223,8 +223,8 @@ def _amplitudes(matched: np.ndarray, energy: np.ndarray, num_tx: int) -> np.ndar
     sets = values.reshape(len(values), energy.shape[1] // num_tx, num_tx, values.shape[2])
     if sets.shape[1] == 1:
         return np.asarray(sets[:, 0])
-    turn = np.exp(-1j * np.angle((sets * sets[:, :1].conj()).sum(axis=3, keepdims=True)))
-    return np.asarray((sets * turn).mean(axis=1))
+    phasor = np.exp(-1j * np.angle((sets * sets[:, :1].conj()).sum(axis=3, keepdims=True)))
+    return np.asarray((sets * phasor).mean(axis=1))
 
 
 def _workspace(sent: _Sent, num_rx: int, rows: int) -> Chirps:
@@ -284,9 +284,9 @@ def match(
         hole = np.abs(np.abs(d) - 1) < 1e-9
         safe = np.where(hole, 0.5, d)
         factor = a.length / 2 * np.where(hole, 0.5, np.sinc(safe) / (1 - safe**2))
-        turn = np.exp(2j * np.pi * (a.carrier * tau % 1 + a.slope * tau * (a.middle - tau / 2)))
+        phasor = np.exp(2j * np.pi * (a.carrier * tau % 1 + a.slope * tau * (a.middle - tau / 2)))
         parts = np.einsum("cr,crl->cl", weight[:, None] * factor, data).reshape(size, -1, 2, LANES)
-        matched = (parts[:, :, 0] + 1j * parts[:, :, 1]) * turn.conj()[:, None, None]
+        matched = (parts[:, :, 0] + 1j * parts[:, :, 1]) * phasor.conj()[:, None, None]
         sums = np.zeros((energy.shape[1], *matched.shape[1:]), complex)
         np.add.at(sums, chirps.tx, matched)
         out[k] += np.stack([sums.real, sums.imag], axis=2).ravel()
@@ -519,10 +519,10 @@ def excess(
     if free == known.channels or not some.any():
         return out
     received, radius = channels[some], known.radius(delays[some])[:, None]
-    turn = 2j * np.pi * known.waveform.effective_carrier
+    j_omega = 2j * np.pi * known.waveform.effective_carrier
     to, fro = (
-        np.exp(turn * element_delays(places, u[some], radius)[0]).conj() / len(places)
-        for places in (a.tx_positions, a.rx_positions)
+        np.exp(j_omega * element_delays(positions, u[some], radius)[0]).conj() / len(positions)
+        for positions in (a.tx_positions, a.rx_positions)
     )
     waves = (received * fro[:, None]).sum(axis=2)
     if known.passes == 2:

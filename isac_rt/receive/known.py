@@ -26,7 +26,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """The chirps of a frame as sent or as decided, and the arrays at both ends.
+    """Chirps of a frame, sent or decided, and the arrays at both ends.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Known:
 
     @classmethod
     def of(cls, cube: IFCube, payload: Payload, antennas: Antennas, passes: int) -> Known:
-        """Return the knowledge of a receiver to which the payload of a frame is known."""
+        """Build the knowledge of a receiver with the payload of a frame."""
         sent = payload.delay_symbols, payload.phases
         return cls(cube.waveform, cube.schedule, *sent, antennas, passes)
 
@@ -60,13 +60,13 @@ class Known:
     def unmodulated(
         cls, waveform: Waveform, schedule: Schedule, antennas: Antennas, passes: int
     ) -> Known:
-        """Return the knowledge of a frame without data."""
+        """Build the knowledge of a frame without data."""
         pilot = unmodulated(waveform)
         return cls(waveform, schedule, pilot.delay_symbols, pilot.phases, antennas, passes)
 
     def decoded(self, spectra: np.ndarray) -> tuple[np.ndarray, Known]:
-        """Spectra (1, L_rx, rows, P) of antennas that send at once, one group for each antenna's
-        code, and what is known of them; as they are where antennas take turns."""
+        """Return spectra (1, L_rx, rows, P) decoded by each antenna's code, one group per antenna,
+        with their knowledge; unchanged where antennas send in turn."""
         codes, w = codes_of(self.waveform), self.waveform
         if codes is None:
             return spectra, self
@@ -75,7 +75,7 @@ class Known:
         return spectra * codes.conj().astype(np.complex64)[:, None, None], known
 
     def alike(self, other: Known) -> bool:
-        """Return whether both hold the same knowledge of one frame."""
+        """Test for the same knowledge of one frame."""
         same = self.antennas == other.antennas and self.passes == other.passes
         same = same and np.array_equal(self.delay_symbols, other.delay_symbols)
         return same and np.array_equal(self.phases, other.phases)
@@ -85,8 +85,8 @@ class Known:
         return []
 
     def mapped(self, spectra: np.ndarray, make: Callable[[], np.ndarray]) -> np.ndarray:
-        """The power map of spectra, made once for all receivers that look at them; whoever changes
-        them changes a copy."""
+        """Return the power map of spectra, cached for receivers with the same spectra, which must
+        not change them."""
         for of, power in self._maps:
             if of() is spectra:
                 return power
@@ -124,27 +124,26 @@ class Known:
 
     @cached_property
     def times(self) -> np.ndarray:
-        """(M, P) middles of the chirps' windows [s] since mid-frame; with data a window lies tau_D
-        later."""
+        """Middles (M, P) of the chirps' windows [s] from mid-frame, tau_D later with data."""
         return self.waveform.middle_time + self.delay_symbols * self.waveform.delay_step
 
     @cached_property
     def slots(self) -> np.ndarray:
-        """(M, P) times of the cleaned chirps in slots: a group is 2 m T_d late, and the window of a
-        chirp with data lies tau_D later."""
+        """Times (M, P) of the cleaned chirps in slots: group m is 2 m T_d later, a chirp with data
+        tau_D later."""
         w = self.waveform
         return (w.chirp_time + self.delay_symbols * w.delay_step) / w.slot_duration
 
     @cached_property
     def sampled_times(self) -> np.ndarray:
-        """(M, P) middles of the chirps' samples [s] since mid-frame."""
+        """Middles (M, P) of the chirps' samples [s] from mid-frame."""
         w = self.waveform
         half = (w.num_samples - 1) / 2 * w.sample_interval
         return w.chirp_time + w.window_start + half - w.frame_duration / 2
 
     @cached_property
     def sent_by(self) -> list[np.ndarray]:
-        """Mark the chirps that each transmit antenna sends, (M, P) bool."""
+        """Chirps of each transmit antenna, (M, P) bool."""
         return [self.schedule == tx for tx in range(self.waveform.num_tx)]
 
     @cached_property
@@ -167,5 +166,5 @@ class Known:
     @overload
     def radius(self, delay: np.ndarray) -> np.ndarray: ...
     def radius(self, delay: float | np.ndarray) -> float | np.ndarray:
-        """Radius of the wavefront of a path [m], one cell at least."""
+        """Return the radius of the wavefront of a path [m], at least one cell."""
         return np.maximum(delay * SPEED_OF_LIGHT / self.passes, self.range_cell)

@@ -28,23 +28,23 @@ bin; reached within 2 % of the unambiguous velocity."""
 
 
 def slow_window(waveform: Waveform) -> np.ndarray:
-    """Hann over the slots (P,), periodic, float32."""
+    """Return Hann's window over the slots (P,), periodic, float32."""
     p = np.arange(waveform.num_chirps) + 0.5
     return hann(p, waveform.num_chirps).astype(np.float32)
 
 
 def doppler_bins(waveform: Waveform) -> np.ndarray:
-    """(P,) bin numbers, ascending from -P/2 (or -(P-1)/2)."""
+    """Return the Doppler bin numbers (P,), ascending from -P/2 (or -(P-1)/2)."""
     return np.fft.fftshift(np.fft.fftfreq(waveform.num_chirps, 1 / waveform.num_chirps))
 
 
 def channel_maps(spectra: np.ndarray, known: Known) -> np.ndarray:
-    """Doppler spectrum of every virtual channel over all its chirps, groups united.
+    """Return the Doppler spectrum of each virtual channel over all its chirps, groups combined.
 
     Parameters
     ----------
     spectra : (M, L_rx, rows, P) complex64 from `clean_spectrum`
-    known : Known, whose data were taken out
+    known : Known, with the removed data
 
     Returns
     -------
@@ -56,49 +56,50 @@ def channel_maps(spectra: np.ndarray, known: Known) -> np.ndarray:
 
 
 def maps_with_power(spectra: np.ndarray, known: Known) -> tuple[np.ndarray, np.ndarray]:
-    """`channel_maps`, and `accumulate` of them, added while they are in the cache."""
+    """Return `channel_maps` and their `accumulate`, computed while they are in the cache."""
     maps = np.empty((known.waveform.num_tx, *spectra.shape[1:]), np.complex64)
     return maps, _mapped(spectra, known, maps)
 
 
 def power_map(spectra: np.ndarray, known: Known) -> np.ndarray:
-    """`accumulate` of the `channel_maps`, which are not kept: (rows, P) float32, centred."""
+    """Return `accumulate` of the `channel_maps` without storing them: (rows, P) float32,
+    centred."""
     return _mapped(spectra, known, np.empty((0, *spectra.shape[1:]), np.complex64))
 
 
 def _mapped(spectra: np.ndarray, known: Known, maps: np.ndarray) -> np.ndarray:
-    """`power_map`; fills (L_tx, L_rx, rows, P) `channel_maps`, or none."""
+    """Return `power_map`; fill in `channel_maps` (L_tx, L_rx, rows, P), if given."""
     power = np.zeros(spectra.shape[2:], np.float32)
-    ends, places, factors = _operators(known)
-    places = 2 * (places[0] * np.uint64(spectra[0].size) + places[1])
+    ends, index, factors = _operators(known)
+    index = 2 * (index[0] * np.uint64(spectra[0].size) + index[1])
     flat = np.ascontiguousarray(spectra).reshape(-1).view(np.float32)
     workspace = aligned(4 * ROWS * len(factors) * PART)
     buffer = np.empty((ROWS, spectra.shape[3]), np.complex64)
-    make_maps(flat, spectra.shape, ends, places, factors, workspace, maps, buffer, power)
+    make_maps(flat, spectra.shape, ends, index, factors, workspace, maps, buffer, power)
     return np.fft.fftshift(power, axes=-1) / (known.waveform.num_tx * spectra.shape[1])
 
 
 @lru_cache(maxsize=8)
 def _operators(known: Known) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the chirps of each transmit antenna begin and end (L_tx + 1,), the groups and numbers
-    of all these chirps (2, S), and the real and imaginary parts of the operators on them for the
-    bins from 0 to P/2, `PART` bins at a time: (blocks, S, 2, PART)."""
+    """Return the bounds of the chirps of each transmit antenna (L_tx + 1,), groups and numbers of
+    all chirps (2, S), and the operators on them for bins 0 to P/2, real and imaginary parts in
+    blocks of `PART` bins (blocks, S, 2, PART)."""
     w, half = known.waveform, known.waveform.num_chirps // 2 + 1
     make = union_operator if known.full else correlation_operator
-    places = [np.nonzero(sent) for sent in known.sent_by]
-    ends = np.cumsum([0, *(numbers.size for _, numbers in places)])
+    index = [np.nonzero(sent) for sent in known.sent_by]
+    ends = np.cumsum([0, *(numbers.size for _, numbers in index)])
     rows = np.concatenate([make(w, known.slots[sent])[:half] for sent in known.sent_by], axis=1)
     blocks = -(-half // PART)
     parts = np.zeros((2, blocks * PART, rows.shape[1]), np.float32)
     parts[:, :half] = rows.real, rows.imag
     factors = aligned(parts.size).reshape(blocks, -1, 2, PART)
     factors[...] = parts.reshape(2, blocks, PART, -1).transpose(1, 3, 0, 2)
-    return ends, np.concatenate(places, axis=1).astype(np.uint64), factors
+    return ends, np.concatenate(index, axis=1).astype(np.uint64), factors
 
 
 class Levels(NamedTuple):
-    """A map and its background (rows, P), and what OMP recovers of the rows with a cell above the
-    threshold, where it was asked (`isac_rt.receive.omp.advise`)."""
+    """Map and background (rows, P), and the rows that OMP recovers, if used
+    (`isac_rt.receive.omp.advise`)."""
 
     power: np.ndarray
     background: np.ndarray
@@ -106,24 +107,22 @@ class Levels(NamedTuple):
 
 
 class LatinUnion:
-    """All groups as one uniform sampling of slow time; the map of a receiver by this way.
+    """Map of all groups as one uniform sampling of slow time.
 
     Attributes
     ----------
-    separate : groups are added in power and not in phase: velocities are known up to the
-        unambiguous velocity divided by L_tx
-    advises : says whether the scene is sparse enough for sparse sampling
-    """
+    separate : add groups in power: the unambiguous velocity is divided by L_tx
+    advises : test whether the scene is sparse enough for sparse sampling"""
 
     separate = False
     advises = False
 
     def power(self, spectra: np.ndarray, known: Known) -> np.ndarray:
-        """(rows, P) power, Doppler centred."""
+        """Return the power (rows, P), Doppler centred."""
         return known.mapped(spectra, lambda: power_map(spectra, known))
 
     def keep(self, above: np.ndarray, levels: Levels, known: Known) -> np.ndarray:
-        """Mark the cells `above` the threshold that may be peaks."""
+        """Mark the cells above the threshold that may be peaks."""
         return above
 
 
@@ -131,7 +130,7 @@ LATIN_UNION = LatinUnion()
 
 
 class Conventional(LatinUnion):
-    """The DFT over each antenna's own chirps in each group."""
+    """Map by the DFT over each antenna's chirps in each group."""
 
     separate = True
     advises = True
@@ -144,13 +143,12 @@ class Conventional(LatinUnion):
 
 
 class Banded(LatinUnion):
-    """Antennas that send at once, each decoded from all chirps.
+    """Map of antennas that send at once, each decoded from all chirps.
 
-    In an antenna's channel the echoes of the others lie whole Doppler bands away. A path shows in
-    all channels in its own band and in fewer of them in the others, so that the strongest band
-    counts, by the power of a cell and its neighbours, and no skirt of the others does. Where codes
-    leave two bands alike the lowest velocities do.
-    """
+    In the channel of an antenna the echoes of the others lie whole Doppler bands away. A path is in
+    all channels in its own band and in fewer in the others: the strongest band, by the power of a
+    cell and its neighbours, is taken, without sidelobes of the others. Of equal bands the one of
+    lowest velocities is taken."""
 
     def keep(self, above: np.ndarray, levels: Levels, known: Known) -> np.ndarray:
         w = known.waveform
@@ -181,7 +179,7 @@ def make_maps(
     flat: np.ndarray,
     shape: tuple[int, ...],
     ends: np.ndarray,
-    places: np.ndarray,
+    index: np.ndarray,
     factors: np.ndarray,
     workspace: np.ndarray,
     maps: np.ndarray,
@@ -191,9 +189,8 @@ def make_maps(
     """Add the power of all virtual channels to power (rows, P), FFT order, and write maps (L_tx,
     L_rx, rows, P) unless there are none.
 
-    `flat` are the real and imaginary parts of samples of `shape`, `places` say where chirps stand
-    in them; `factors` see `_operators`. `workspace` and `buffer` are work space.
-    """
+    `flat`: real and imaginary parts of samples of `shape`; `index`: position of the chirps in them;
+    `factors`: see `_operators`; `workspace` and `buffer`: memory of the kernel."""
     num_rx, num_rows, num_chirps = shape[1:]
     samples = flat.view(np.complex64)
     half = num_chirps // 2 + 1
@@ -202,7 +199,7 @@ def make_maps(
     lines = np.arange(num_rx * num_rows)[:, None] * num_chirps
     for tx in range(ends.size - 1):
         own = slice(ends[tx], ends[tx + 1])
-        x = samples[lines + places[own].astype(np.int64) // 2]
+        x = samples[lines + index[own].astype(np.int64) // 2]
         # the rows of the operator for opposite bins are conjugates
         made = x @ (real[:, own] + 1j * imag[:, own]).T, x @ (real[:, own] - 1j * imag[:, own]).T
         opposite = made[1][:, (num_chirps - 1) // 2 : 0 : -1]
@@ -213,29 +210,28 @@ def make_maps(
 
 
 def correlation_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
-    """(P, S) complex64: from S samples at `times` [slots] to their windowed correlations with the
-    Doppler atoms."""
+    """Return the operator (P, S) complex64 from S samples at `times` [slots] to their windowed
+    correlations with the Doppler atoms."""
     bins = np.fft.fftfreq(waveform.num_chirps, 1 / waveform.num_chirps)
     atoms = np.exp(-2j * np.pi * np.outer(bins, times) / waveform.num_chirps)
     return (atoms * slow_window(waveform)[np.floor(times).astype(int)]).astype(np.complex64)
 
 
 def union_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
-    """(P, P) complex64: from one antenna's samples at `times` [slots], one in each slot, to its
-    windowed Doppler spectrum.
+    """Return the operator (P, P) complex64 from one antenna's samples at `times` [slots], one per
+    slot, to its windowed Doppler spectrum.
 
-    The times are not quite uniform. The plain DFT, or turning each bin by its own group phase,
-    would leave sidelobes of -25 to -35 dB at all other velocities. Here the samples are resampled
-    to the uniform grid (about the mean offset) by the least-squares fit of all tones up to the
-    unambiguous velocity: the normal equations of that band have the entries sinc(t - t'). What
-    remains is below -60 dB, and below -50 dB within 2 % of the unambiguous velocity.
-    """
+    The times are slightly non-uniform: a plain DFT, or a phase per group and bin, leaves sidelobes
+    of -25 to -35 dB. The samples are resampled to a uniform grid about the mean offset by the
+    least-squares fit of all tones up to the unambiguous velocity, whose normal equations have the
+    entries sinc(t - t'). Sidelobes are then below -60 dB, or -50 dB within 2 % of the unambiguous
+    velocity."""
     return _united(waveform, np.asarray(times, float).tobytes())
 
 
 @lru_cache(maxsize=16)
 def _united(waveform: Waveform, stored: bytes) -> np.ndarray:
-    """`union_operator`, once for all receivers that read the same data."""
+    """Return `union_operator`, cached for receivers with the same data."""
     times = np.frombuffer(stored)
     p = np.arange(waveform.num_chirps)
     grid = p + (times - np.floor(times)).mean()
@@ -247,7 +243,7 @@ def _united(waveform: Waveform, stored: bytes) -> np.ndarray:
 
 
 def accumulate(maps: np.ndarray) -> np.ndarray:
-    """Mean power over the virtual channels, Doppler centred: (rows, P) float32."""
+    """Return the mean power over the virtual channels, Doppler centred: (rows, P) float32."""
     power = np.zeros(maps.shape[-2:], np.float32)
     for channel in maps.reshape(-1, *maps.shape[-2:]):
         power += channel.real**2 + channel.imag**2
@@ -255,12 +251,12 @@ def accumulate(maps: np.ndarray) -> np.ndarray:
 
 
 def conventional_power(spectra: np.ndarray, known: Known) -> np.ndarray:
-    """Mean power of the DFT over each antenna's own chirps in each group: the conventional TDM-MIMO
-    receiver, schemes (a) and (c).
+    """Return the mean power of the DFT over each antenna's chirps in each group: the conventional
+    TDM-MIMO receiver, schemes (a) and (c).
 
-    An antenna's P/L_tx samples lie L_tx slots apart, so the map repeats every P/L_tx bins:
-    velocities are known up to the unambiguous velocity divided by L_tx. Groups are added in power.
-    The few slots by which the antennas' samples start later, and the data delays, only turn phases.
+    The P/L_tx samples of an antenna are L_tx slots apart, so the map repeats every P/L_tx bins: the
+    unambiguous velocity is divided by L_tx. Groups are added in power. Start slots of antennas and
+    data delays change phases only.
 
     Returns
     -------
@@ -270,8 +266,8 @@ def conventional_power(spectra: np.ndarray, known: Known) -> np.ndarray:
     num_tx = known.waveform.num_tx
     size = num_chirps // num_tx
     window = hann(np.arange(size) + 0.5, size)
-    turns = np.exp(-2j * np.pi * np.outer(np.arange(size), np.arange(size)) / size)
-    analyse = (turns * window).astype(np.complex64)
+    dft = np.exp(-2j * np.pi * np.outer(np.arange(size), np.arange(size)) / size)
+    analyse = (dft * window).astype(np.complex64)
     power = np.zeros((num_rows, size), np.float32)
     for m in range(num_groups):
         for sent in known.sent_by:
@@ -281,7 +277,7 @@ def conventional_power(spectra: np.ndarray, known: Known) -> np.ndarray:
 
 
 def own_bins(waveform: Waveform) -> np.ndarray:
-    """(P,) bool: the centred bins within the unambiguous velocity of one antenna's uniform
+    """Mark the centred bins (P,) within the unambiguous velocity of one antenna's uniform
     sampling."""
     size = waveform.num_chirps // waveform.num_tx
     bins = doppler_bins(waveform)

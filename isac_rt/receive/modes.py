@@ -1,4 +1,4 @@
-r"""A slow change of amplitude and phase over the chirp, seen in the few range rows about a path.
+r"""Slow change of amplitude and phase over the chirp, estimated from the range rows about a path.
 
 Over x = -1 .. 1 of the range window a channel's response is :math:`\sum_j q_j P_j(x)` with
 polynomials that are orthonormal under the squared Hann window, so that noise in the q_j is alike

@@ -122,9 +122,9 @@ class PassiveReceiver:
         if self.refiner is not None and reference is not None:
             decided = self._phases(moments, detections)
         if decided is not None:
-            turn = decided.phases.conj() * known.phases
-            if np.abs(turn - 1).max() > SAME_PHASE:
-                spectra = spectra * turn.astype(np.complex64)[:, None, None]
+            phasor = decided.phases.conj() * known.phases
+            if np.abs(phasor - 1).max() > SAME_PHASE:
+                spectra = spectra * phasor.astype(np.complex64)[:, None, None]
                 moments = moments.read_by(replace(known, phases=decided.phases))
                 found, detections, reference = self._sense_data(spectra, moments, prediction, hints)
         else:
@@ -266,10 +266,10 @@ class PassiveReceiver:
         if reference is None or not self.settings.separate_reference:
             return detections, reference
         first = detections.select(detections.is_reference)
-        apart = None if first.starts[0] else separate(moments, first)
-        if apart is None:
+        separated = None if first.starts[0] else separate(moments, first)
+        if separated is None:
             return detections, reference
-        both, power = apart
+        both, power = separated
         line = float(power[both.is_reference][0])
         channels = reference.channels * np.sqrt(line / _power(reference))
         kept = detections.select(_off(detections, both, moments.known) & ~detections.is_reference)
@@ -402,9 +402,9 @@ def receive_passive(
 def _off(detections: Detections, paths: Detections, known: Known) -> np.ndarray:
     """(Q,) which detections are more than a cell of range or of velocity off all of some paths."""
     w, d = known.waveform, detections
-    apart = np.abs(d.range[:, None] - paths.range) / w.range_cell(1) > 1
-    apart |= np.abs(d.velocity[:, None] - paths.velocity) / w.velocity_cell(1) > 1
-    return apart.all(axis=1)
+    is_far = np.abs(d.range[:, None] - paths.range) / w.range_cell(1) > 1
+    is_far |= np.abs(d.velocity[:, None] - paths.velocity) / w.velocity_cell(1) > 1
+    return is_far.all(axis=1)
 
 
 def _among_all(mine: Reception, groups: Sequence[int], waveform: Waveform) -> Reception:

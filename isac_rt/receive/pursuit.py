@@ -1,5 +1,5 @@
-"""Orthogonal matching pursuit off the grid: paths found one after the other, each taken out whole
-before the next is sought.
+"""Orthogonal matching pursuit off the grid: paths are estimated in sequence, each subtracted before
+the next is sought.
 
 The dictionary is not the Doppler grid but every path that the frame can hold: range, velocity and
 migration by maximum likelihood, an amplitude for each channel, and each element's delay. A strong
@@ -42,13 +42,13 @@ from isac_rt.receive.types import NO_HINTS, Hints
 FARTHEST_REACH = 24
 """Range rows on each side in which the strongest paths are taken out; Hann's lobes are 90 dB down
 there."""
-LEAST, FELT = 0.01, 0.1
+LEAST, MIN_INFLUENCE = 0.01, 0.1
 """Of the noise in a cell: what a path leaves in it below the first is not taken out, and below the
 second not felt by another path."""
 CYCLES, SETTLED, SETTLED_STD = 6, 2e-3, 0.25
 """Most times that the paths which a new one touches are estimated again, each with the others taken
 out, and the move that ends it, in cells and bins and in deviations."""
-LEFT_OVER_DB = 35.0
+RESIDUAL_DB = 35.0
 """What is this far under a path found before, within `NEAR` rows and bins of it, is what its
 removal left."""
 NEAR = (3, 4)
@@ -61,7 +61,7 @@ CLOSE = STENCILS[1:]
 
 @dataclass(frozen=True)
 class Pursuit(Cfar):
-    """The CFAR on what the paths found before leave."""
+    """CFAR on the residual of the paths found before."""
 
     doppler: LatinUnion | None = LATIN_UNION
 
@@ -77,8 +77,8 @@ class Pursuit(Cfar):
 
 @dataclass(frozen=True)
 class BySchedule(Cfar):
-    """The CFAR on the map that the schedule asks for, and `Pursuit` where slow time is sampled
-    sparsely: there the map has sidelobes at all velocities. On the grid the paper's OMP."""
+    """CFAR with the Doppler processing of the schedule, and `Pursuit` for sparse sampling of slow
+    time, whose sidelobes lie at all velocities; on the grid the paper's OMP."""
 
     def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
         if isinstance(doppler_of(known), Omp) and not self.estimator.on_grid:
@@ -88,8 +88,8 @@ class BySchedule(Cfar):
 
 @dataclass
 class _Path:
-    """A path that was found: its estimate, its power on the map when it was, and what of it is
-    taken out: rows [first, last), and the elements' delays [cells]."""
+    """A found path: its estimate, its power on the map, the rows [first, last) from which it is
+    subtracted, and the elements' delays [cells]."""
 
     estimate: Estimate
     power: float
@@ -137,15 +137,15 @@ def pursue(
 
 
 class Taken(NamedTuple):
-    """Strong paths of a frame and what is left without them.
+    """Strong paths of a frame and the residual.
 
     Attributes
     ----------
     paths : list of Estimate
     snr : of each, on the map in which it was found
-    whole : (rows, P) power before anything was taken out
-    left : spectra without the paths
-    maps : `channel_maps` of what is left
+    whole : (rows, P) power before subtraction
+    left : residual spectra
+    maps : `channel_maps` of the residual
     power : `accumulate` of these
     """
 
@@ -158,7 +158,7 @@ class Taken(NamedTuple):
 
 
 def take_strong(spectra: np.ndarray, known: Known, settings: Receivers) -> Taken:
-    """Paths `STRONG_DB` over the noise and more; parameters as for `pursue`."""
+    """Subtract the paths at least `STRONG_DB` over the noise; parameters as for `pursue`."""
     left, floor = spectra.copy(), sidelobe_floor(known)
     maps, power = maps_with_power(left, known)
     whole = known.mapped(spectra, lambda: power)
@@ -206,7 +206,7 @@ def _find(
 
 
 def _map_again(power: np.ndarray, left: np.ndarray, changed: np.ndarray, known: Known) -> None:
-    """Make the rows of the map anew in which something was taken out, in place."""
+    """Recompute the rows of the map with subtracted paths, in place."""
     power[changed] = power_map(left[:, :, changed], known)
 
 
@@ -221,11 +221,11 @@ def sidelobe_floor(known: Known) -> float:
 
 
 def _mark(taken: np.ndarray, row: int, column: int, peak: float) -> None:
-    """Raise, in place, the power about a peak under which a cell holds its remainder."""
+    """Raise, in place, the power about a peak below which a cell holds its residual."""
     rows = np.arange(max(row - NEAR[0], 0), min(row + NEAR[0] + 1, len(taken)))
     columns = (np.arange(-NEAR[1], NEAR[1] + 1) + column) % taken.shape[1]
     block = np.ix_(rows, columns)
-    taken[block] = np.maximum(taken[block], peak * 10 ** (-LEFT_OVER_DB / 10))
+    taken[block] = np.maximum(taken[block], peak * 10 ** (-RESIDUAL_DB / 10))
 
 
 def _fit_again(
@@ -242,18 +242,18 @@ def _fit_again(
     w = known.waveform
     power = np.array([f.power for f in found])
     rate = 1 / (w.frame_duration * w.effective_carrier)
-    place = np.array(
+    cells = np.array(
         [
             [w.beat_cells(f.estimate.delay, f.estimate.delay_rate).mean() for f in found],
             [f.estimate.delay_rate / rate for f in found],
         ]
     )
-    rows, bins = np.abs(place[:, :, None] - place[:, None, :])
+    rows, bins = np.abs(cells[:, :, None] - cells[:, None, :])
     bins = np.minimum(bins % w.num_chirps, -bins % w.num_chirps)
     lobes = hann_envelope(np.maximum(rows - 1, 0)) * (
         hann_envelope(np.maximum(bins - 1, 0)) + sidelobe_floor(known)
     )
-    touches = np.minimum(power[:, None], power) * lobes > FELT * noise
+    touches = np.minimum(power[:, None], power) * lobes > MIN_INFLUENCE * noise
     np.fill_diagonal(touches, False)
     fresh = np.arange(len(found)) >= len(found) - count
     near = np.flatnonzero((touches & (fresh | fresh[:, None])).any(axis=1))
@@ -263,7 +263,7 @@ def _fit_again(
             path, before = found[k], found[k].estimate
             _add(spectra, path, known, 1.0)
             changed[slice(*path.rows)] = True
-            row = min(max(round(float(place[0, k])), 0), spectra.shape[2] - 1)
+            row = min(max(round(float(cells[0, k])), 0), spectra.shape[2] - 1)
             local = LocalSpectra(spectra, known, row)
             path.estimate = refine(local, before.delay, before.delay_rate, CLOSE)
             if cycle == 0:
@@ -283,8 +283,8 @@ def _fit_again(
 
 
 def _take_out(spectra: np.ndarray, path: _Path, known: Known, noise: float) -> None:
-    """Subtract a path in place from the rows in which it is felt. The template is that of
-    `LocalSpectra` with each element's own delay."""
+    """Subtract a path in place from its rows, with the template of `LocalSpectra` and each
+    element's own delay."""
     w, e = known.waveform, path.estimate
     middle = round(float(w.beat_cells(e.delay, e.delay_rate).mean()))
     # of Hann's lobes, 1 / (pi d^3)^2; a row for migration
@@ -301,7 +301,7 @@ def _take_out(spectra: np.ndarray, path: _Path, known: Known, noise: float) -> N
 
 
 def _add(spectra: np.ndarray, path: _Path, known: Known, sign: float) -> None:
-    """Add a path times `sign` to the rows in which it was taken out, in place."""
+    """Add a path times `sign` to its rows, in place."""
     w, e = known.waveform, path.estimate
     cycles = w.phase(e.delay + e.delay_rate * known.times, w.window_middle)
     add_template(
@@ -324,14 +324,14 @@ def add_template(
     channels: np.ndarray,
     schedule: np.ndarray,
     beat: np.ndarray,
-    turn: np.ndarray,
+    phasor: np.ndarray,
     sent: np.ndarray,
     received: np.ndarray,
     window: tuple[float, float],
 ) -> None:
     """Add a path's template in place.
 
-    spectra[m, rx, i, p] += channels[tx, rx] turn[m, p] h(beat + sent + received - i) exp(-j pi i
+    spectra[m, rx, i, p] += channels[tx, rx] phasor[m, p] h(beat + sent + received - i) exp(-j pi i
     length / size), tx the antenna of the chirp, for i in [*rows), h the transform of the window
     (`hann_response`) of `window` length and size [samples].
     """
@@ -339,10 +339,10 @@ def add_template(
     row, share = np.arange(*rows)[:, None], length / size
     back = np.exp(-1j * np.pi * share * row)
     for rx in range(spectra.shape[1]):
-        place = (beat + sent[schedule] + received[rx])[:, None]
-        d = (place - row) * share
+        beats = (beat + sent[schedule] + received[rx])[:, None]
+        d = (beats - row) * share
         hole = np.abs(np.abs(d) - 1) < 1e-6
         safe = np.where(hole, 0.5, d)
         shape = length / 2 * np.where(hole, 0.5, np.sinc(safe) / (1 - safe**2))
-        factor = channels[schedule, rx] * turn
+        factor = channels[schedule, rx] * phasor
         spectra[:, rx, rows[0] : rows[1]] += factor[:, None] * back * shape

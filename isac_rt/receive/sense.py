@@ -1,4 +1,4 @@
-"""From cleaned spectra to detections: the CFAR on range-Doppler maps."""
+"""Detection in cleaned spectra: CFAR on range-Doppler maps."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ MIXED = 0.1
 """Power of other paths over its own from which a detection starts no track, beside what noise
 adds: the range of a mixed cell wanders from frame to frame."""
 
-MOST_LOOKS = 24
+MAX_PATHS = 24
 """Strongest paths of a frame that are looked at for self-calibration."""
 
 
@@ -67,34 +67,33 @@ class Sensed:
 
 
 class Detector(Protocol):
-    """Protocol of a detector: it finds paths in cleaned spectra (M, L_rx, rows, P)."""
+    """Protocol of a detector of paths in cleaned spectra (M, L_rx, rows, P)."""
 
     def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
-        """Return what a frame shows."""
+        """Detect paths in a frame."""
         ...
 
 
 @dataclass(frozen=True)
 class Cfar:
-    """Peaks of the range-Doppler map that stand out of their surroundings.
+    """Greatest-of CFAR on the range-Doppler map.
 
     Attributes
     ----------
     settings : Receivers
     estimator : of the peaks
-    doppler : how the map is made; None: as the schedule asks for (`doppler_of`)
-    """
+    doppler : method of the map; None: by the schedule (`doppler_of`)"""
 
     settings: Receivers
     estimator: Estimator = OFF_GRID
     doppler: LatinUnion | None = None
 
     def way(self, known: Known) -> LatinUnion:
-        """Return how the map of a frame is made."""
+        """Return the Doppler processing of a frame."""
         return self.doppler or doppler_of(known)
 
     def rule(self, known: Known) -> CfarRule:
-        """The rule for the map of a frame."""
+        """Return the CFAR rule of a frame."""
         groups = len(known.schedule) if self.way(known).separate else 1
         return CfarRule.of(self.settings, groups * known.channels)
 
@@ -106,12 +105,12 @@ class Cfar:
         rows: np.ndarray,
         columns: np.ndarray,
     ) -> list[Estimate]:
-        """The paths at peaks (Q,) of the map."""
+        """Estimate the paths at peaks (Q,) of the map."""
         separate = self.way(known).separate
         return self.estimator.at_peaks(spectra, known, power, rows, columns, separate=separate)
 
     def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
-        """Range-Doppler map, CFAR, peaks, and an estimate of each."""
+        """Compute the range-Doppler map, apply CFAR, and estimate a path at each peak."""
         way = self.way(known)
         power = way.power(spectra, known)
         above, level = self.rule(known).detect(power)
@@ -131,9 +130,8 @@ class Cfar:
 
 
 def doppler_of(known: Known) -> LatinUnion:
-    """The union where it samples every antenna in every slot, by bands where all send at once; else
-    each antenna's own DFT where its chirps are equally spaced, as in a conventional schedule; OMP
-    elsewhere."""
+    """Choose the Doppler processing of a schedule: bands if all antennas send at once; the union if
+    it samples each antenna in each slot; each antenna's DFT for equally spaced chirps; else OMP."""
     if known.full:
         return Banded() if known.waveform.bands > 1 else LatinUnion()
     schedule, num_tx = known.schedule, known.waveform.num_tx
@@ -142,8 +140,8 @@ def doppler_of(known: Known) -> LatinUnion:
 
 
 def window_gain(known: Known) -> float:
-    """Noise power of a map's cell over that of a sample of the spectra: the squared window over an
-    antenna's chirps."""
+    """Return the noise power of a map's cell over that of the spectra: the sum of the squared
+    window over an antenna's chirps."""
     w = known.waveform
     return float((slow_window(w) ** 2).sum()) * len(known.schedule) / w.num_tx
 
@@ -151,9 +149,9 @@ def window_gain(known: Known) -> float:
 def measure_channels(
     spectra: np.ndarray, known: Known, estimates: Sequence[Estimate], snr: np.ndarray
 ) -> tuple[PathChannels, ...]:
-    """Return the channels as the `MOST_LOOKS` strongest of the paths show them."""
+    """Return the channels measured by the `MAX_PATHS` strongest paths."""
     out = []
-    for i in np.argsort(snr)[::-1][:MOST_LOOKS]:
+    for i in np.argsort(snr)[::-1][:MAX_PATHS]:
         delay, rate = estimates[i].delay, estimates[i].delay_rate
         row = round(float(known.waveform.beat_cells(delay, rate, 0.0)))
         if 0 <= row < spectra.shape[2] and (known.full or known.passes == 1):
@@ -170,12 +168,11 @@ def describe(
     on_grid: bool = False,
     mixed: float = MIXED,
 ) -> Detections:
-    """Detections in ranges, velocities and direction cosines; what lies outside the field of view
-    has no direction. `on_grid`: of the directions too the nearest grid point, eight to a beam.
+    """Convert estimates to ranges, velocities and direction cosines, NaN outside the field of view.
+    `on_grid`: directions on a grid too, eight per beam.
 
-    What a single wave does not explain, such as a wall, carries on a track and starts none: where
-    others have more than `mixed` of its power.
-    """
+    A detection in which other waves have more than `mixed` of its power, such as a wall, updates
+    tracks but starts none."""
     count = len(estimates)
     shape = count, known.antennas.num_tx, known.antennas.num_rx
     channels = np.array([e.channels for e in estimates], complex).reshape(shape)
@@ -195,8 +192,8 @@ def describe(
 
 
 def equivalent_range_power(cube: IFCube) -> np.ndarray:
-    """(N, P) mean power over the receivers, over range cell and chirp of the first group, before
-    any data are removed."""
+    """Return the mean power (N, P) over the receivers by range cell and chirp of the first group,
+    before data removal."""
     total = np.zeros((cube.samples.shape[3], cube.samples.shape[2]), np.float32)
     for one in cube.samples[0]:
         spectrum = scipy.fft.fft(one, axis=1, workers=1)
@@ -205,7 +202,8 @@ def equivalent_range_power(cube: IFCube) -> np.ndarray:
 
 
 def make_maps(power: np.ndarray, cube: IFCube, settings: Receivers, passes: int) -> Maps:
-    """Maps with their axes; the range axis ignores the range-Doppler coupling (under a cell)."""
+    """Return the maps with their axes; the range axis omits range-Doppler coupling (under a
+    cell)."""
     w, before = cube.waveform, equivalent_range_power(cube)
     rule = CfarRule.of(settings, cube.samples.shape[1])
     return Maps(

@@ -44,7 +44,7 @@ def transform(
     cells: np.ndarray,
     out: np.ndarray,
     *,
-    turn: np.ndarray | None = None,
+    phasor: np.ndarray | None = None,
     power: np.ndarray | None = None,
     tapered: np.ndarray | None = None,
 ) -> None:
@@ -57,7 +57,7 @@ def transform(
     cells : (rows,) int, c, modulo N
     out : (L_rx, rows, P) complex64, filled with Y; soonest from an address that is a multiple of 64
         (`isac_rt.kernels.vector.new_memory`)
-    turn : (rows, P) complex64, g; None: 1
+    phasor : (rows, P) complex64, g; None: 1
     power : (P, N) float32, to which sum_r |spectrum|^2 is added over all cells, without g
     tapered : likewise of the samples under Hann's window, which takes half of a cell less a quarter
         of both neighbours
@@ -68,23 +68,23 @@ def transform(
     except ValueError:
         size = 0
     if size == 0 or size % 8:
-        transform_plain(samples, factor, cells, out, turn=turn, power=power, tapered=tapered)
+        transform_plain(samples, factor, cells, out, phasor=phasor, power=power, tapered=tapered)
         return
-    place = order[-np.arange(size) % size] * ROW  # the lane transform turns the other way
-    turns = np.zeros((0, 1), np.complex64) if turn is None else turn
+    lane_order = order[-np.arange(size) % size] * ROW  # the lane transform turns the other way
+    phasors = np.zeros((0, 1), np.complex64) if phasor is None else phasor
     none = np.zeros((0, size), np.float32)
     powers = none if power is None else power, none if tapered is None else tapered
-    sizes = size, size, len(turns), *(len(wanted) and size // 2 for wanted in powers)
+    sizes = size, size, len(phasors), *(len(wanted) and size // 2 for wanted in powers)
     fill_cells(
         _floats(samples),
         _floats(factor),
-        _floats(turns),
+        _floats(phasors),
         powers,
         out.view(np.float32),
         radices,
         twiddles,
-        place,
-        place[np.asarray(cells) % size],
+        lane_order,
+        lane_order[np.asarray(cells) % size],
         Tables(*(aligned(rows * ROW) for rows in sizes)),
     )
 
@@ -100,7 +100,7 @@ def transform_plain(
     cells: np.ndarray,
     out: np.ndarray,
     *,
-    turn: np.ndarray | None = None,
+    phasor: np.ndarray | None = None,
     power: np.ndarray | None = None,
     tapered: np.ndarray | None = None,
 ) -> None:
@@ -114,36 +114,36 @@ def transform_plain(
             beside = np.roll(spectrum, 1, axis=1) + np.roll(spectrum, -1, axis=1)
             tapered += np.abs(spectrum / 2 - beside / 4) ** 2
         out[r] = spectrum[:, np.asarray(cells) % samples.shape[-1]].T
-        if turn is not None:
-            out[r] *= turn
+        if phasor is not None:
+            out[r] *= phasor
 
 
 @twin_of(receive_transform.transform)
 def fill_cells(
     samples: np.ndarray,
     factor: np.ndarray,
-    turn: np.ndarray,
+    phasor: np.ndarray,
     powers: tuple[np.ndarray, np.ndarray],
     out: np.ndarray,
     radices: np.ndarray,
     twiddles: np.ndarray,
-    place: np.ndarray,
+    lane_order: np.ndarray,
     at: np.ndarray,
     work: Tables,
 ) -> None:
     """Fill cells of range spectra (module docstring), complex arrays as `_floats`.
 
-    `place` says where each cell lies in the lane transform of `radices` and `twiddles`, `at` where
+    `lane_order` holds each cell's row in the lane transform of `radices` and `twiddles`, `at` where
     the wanted cells do; `powers` are `power` and `tapered`, or empty.
     """
-    order = np.argsort(place)
-    cells = order[np.searchsorted(place[order], at)]
+    order = np.argsort(lane_order)
+    cells = order[np.searchsorted(lane_order[order], at)]
     transform_plain(
         samples.view(np.complex64),
         factor.view(np.complex64),
         cells,
         out.view(np.complex64),
-        turn=turn.view(np.complex64) if turn.size else None,
+        phasor=phasor.view(np.complex64) if phasor.size else None,
         power=powers[0] if powers[0].size else None,
         tapered=powers[1] if powers[1].size else None,
     )
@@ -203,8 +203,8 @@ def clean_spectrum(cube: IFCube, known: Known, num_rows: int | None = None) -> n
     for m in range(num_groups):
         factor = _factors(num_samples, symbols[m], shift[m], w.window_length)
         phase = known.phases[m].conj() * np.exp(-2j * np.pi * w.data_phase(symbols[m]))
-        turn = phase.astype(np.complex64) * tones(shift[m] / num_samples, num_rows).T
-        transform(samples[m], factor, np.arange(num_rows), out[m], turn=turn)
+        phasor = phase.astype(np.complex64) * tones(shift[m] / num_samples, num_rows).T
+        transform(samples[m], factor, np.arange(num_rows), out[m], phasor=phasor)
     return out
 
 

@@ -179,10 +179,10 @@ def demodulate(
     cells = symbol_cells(w)
     spectra = new_memory((picked.shape[1], cells.size, shape[1]))
     for m in range(shape[0]):
-        turn = tones(-beats[m] / w.num_samples, w.num_samples)
-        power, tapered = np.zeros((2, *turn.shape), np.float32)
+        derotation = tones(-beats[m] / w.num_samples, w.num_samples)
+        power, tapered = np.zeros((2, *derotation.shape), np.float32)
         wanted = None if run_cells is None else tapered
-        transform(cube.samples[m], turn, cells, spectra, power=power, tapered=wanted)
+        transform(cube.samples[m], derotation, cells, spectra, power=power, tapered=wanted)
         if run_cells is not None:
             power[runs(tapered / len(spectra), len(spectra), run_cells)] = 0
         raw[m], sure[m] = decide(power, [(g, o[m]) for g, o in others], w)
@@ -285,12 +285,12 @@ def nearest_symbols(summed: np.ndarray, order: int) -> tuple[np.ndarray, float]:
 def least_spread(summed: np.ndarray, length: np.ndarray, far: float, order: int) -> float:
     """Return the least `phase_spread` of `transition_sums`, `length` apart in time [s], of all
     errors of the Doppler frequency up to `far` [Hz], and to `READABLE_TURN`."""
-    phase, turns = np.angle(summed), 2 * np.pi * length
+    phase, radians = np.angle(summed), 2 * np.pi * length
     far = min(far, READABLE_TURN / (order * float(length.mean())))
     # neighbouring errors turn the longest transition by a fifth of a symbol
     steps = int(np.ceil(far * length.max() * order / 0.2))
     errors = np.linspace(-far, far, 2 * steps + 1)
-    off = (phase - np.multiply.outer(errors, turns)) / (2 * np.pi / order)
+    off = (phase - np.multiply.outer(errors, radians)) / (2 * np.pi / order)
     spread = ((off - np.round(off)) ** 2).reshape(errors.size, -1).mean(axis=1)
     return float(np.sqrt(spread.min()) * 2 * np.pi / order)
 
@@ -300,14 +300,14 @@ def gathering(
 ) -> Gathering:
     """Return how `transition_sums`, `length` apart in time [s], gather for errors of the Doppler
     frequency up to `far` [Hz], and for those beyond, up to `farthest`."""
-    turns = 2 * np.pi * order * length.ravel()
+    radians = 2 * np.pi * order * length.ravel()
     # spacings that turn the longest transition to the power D by a fiftieth, and by a fifth
     fine, coarse = (share / (length.max() * order) for share in (0.02, 0.2))
     near = np.linspace(-far, far, 2 * int(np.ceil(far / fine)) + 1)
     beyond = np.arange(far + coarse, farthest, coarse)
     beyond = np.concatenate([-beyond, beyond])
     inside, outside = (
-        np.cos(order * np.angle(summed).ravel() - np.multiply.outer(errors, turns)).mean(axis=1)
+        np.cos(order * np.angle(summed).ravel() - np.multiply.outer(errors, radians)).mean(axis=1)
         for errors in (near, beyond)
     )
     size = near.size + beyond.size

@@ -283,7 +283,7 @@ DETECTIONS: dict[str, Column] = {
         "labels.face",
         np.int32,
     ),
-    "skirt": _number(
+    "sidelobe": _number(
         "the path that explains it lies more than a cell away", "labels.sidelobe", bool
     ),
 }

@@ -77,7 +77,7 @@ def fused_positions(dataset: xr.Dataset, frame: int, picture: str) -> np.ndarray
     return np.column_stack([dataset[f"fused_{axis}"].values[mine] for axis in "xyz"])
 
 
-READ_LATE = ("decoded", "latency_frames", "symbol_errors", "symbol_erased", "symbols")
+LATE_VARIABLES = ("decoded", "latency_frames", "symbol_errors", "symbol_erased", "symbols")
 """Of an observer what changes when a frame is read after others have come."""
 
 
@@ -244,26 +244,26 @@ def _put_ragged(
     order = np.argsort(frame, kind="stable")
     number = np.repeat(np.arange(len(of)), [len(table.frames()) for table in of])
     rows = np.concatenate([table.whole() for table in of])
-    _put_places(put, kind, dim, along, np.column_stack([frame, number])[order])
+    _put_index(put, kind, dim, along, np.column_stack([frame, number])[order])
     for name, column in TABLES[kind].items():
         values = rows[name][order]
         put(f"{kind}_{name}", [dim, *column.dims], values, column.units, column.meaning)
 
 
-def _put_places(
-    put: Callable[..., None], prefix: str, dim: str, along: str, places: np.ndarray
+def _put_index(
+    put: Callable[..., None], prefix: str, dim: str, along: str, index: np.ndarray
 ) -> None:
     """Put the frame, and the index along another dimension, of each row (K, 2)."""
     for k, name in enumerate(("frame", along)):
         meaning = f"position along the dimension {name}"
-        put(f"{prefix}_{name}", [dim], places[:, k].astype(np.int32), DIMENSIONLESS, meaning)
+        put(f"{prefix}_{name}", [dim], index[:, k].astype(np.int32), DIMENSIONLESS, meaning)
 
 
 def _put_paths(put: Callable[..., None], found: Sequence[tuple[int, int, Columns]]) -> None:
     """The paths of the snapshots."""
-    places = np.array([[i, j] for i, j, _ in found], int).reshape(-1, 2)
+    index = np.array([[i, j] for i, j, _ in found], int).reshape(-1, 2)
     count = [len(ledger["delay"]) for _, _, ledger in found]
-    _put_places(put, "path", "path", "observer", np.repeat(places, count, axis=0))
+    _put_index(put, "path", "path", "observer", np.repeat(index, count, axis=0))
     for name, column in PATHS.items():
         parts: list[np.ndarray] = [np.asarray(one[name], column.dtype) for _, _, one in found]
         values = stacked(parts, column)

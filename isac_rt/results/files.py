@@ -166,7 +166,7 @@ def check_folder(folder: str | Path) -> None:
     if free < ROOM_BYTES:
         raise StorageError(
             f"{folder}: {free / 1e6:.0f} MB are free, a run is given {ROOM_BYTES / 1e6:.0f} MB at "
-            "least; choose another place with --out, or make room"
+            "least; choose another folder with --out, or make room"
         )
 
 

@@ -67,7 +67,7 @@ def reach(distance: np.ndarray) -> np.ndarray:
     return np.where(d <= 1, 1.0, np.where(d < 2, np.maximum(hann_response(d), lobes), lobes))
 
 
-class Places(NamedTuple):
+class MapPositions(NamedTuple):
     """Paths or estimates in the terms of `Detections`.
 
     Attributes
@@ -83,18 +83,20 @@ class Places(NamedTuple):
     span: float
 
     @classmethod
-    def of(cls, paths: PathSet, waveform: Waveform, passes: int) -> Places:
+    def of(cls, paths: PathSet, waveform: Waveform, passes: int) -> MapPositions:
         """Where a receiver sees paths."""
         metres = SPEED_OF_LIGHT / passes
         return cls.at(metres * paths.delay, metres * paths.delay_rate, waveform, passes)
 
     @classmethod
-    def at(cls, range: np.ndarray, velocity: np.ndarray, waveform: Waveform, passes: int) -> Places:
+    def at(
+        cls, range: np.ndarray, velocity: np.ndarray, waveform: Waveform, passes: int
+    ) -> MapPositions:
         """Where detections or tracks lie."""
         cells = waveform.range_cell(passes), waveform.velocity_cell(passes)
         return cls(range, velocity, cells, 2 * waveform.max_velocity(passes))
 
-    def apart(
+    def distances(
         self, range: float | np.ndarray, velocity: float | np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Distances from a place in range and Doppler cells, velocities modulo the unambiguous
@@ -140,12 +142,12 @@ def explain(
     cell_gain : power over the noise of one channel's cell, of a path of unit power
     aim : of `paths`; None: their directions do not count
     """
-    places, power = Places.of(paths, waveform, passes), paths.power * cell_gain
+    positions, power = MapPositions.of(paths, waveform, passes), paths.power * cell_gain
     diffuse = paths.kind == PathKind.DIFFUSE
     if aim is None:
         aim = Aim(np.full((len(paths), 2), np.nan), np.ones(2))
     cause, near = np.full(len(detections), -1), np.zeros(len(detections), bool)
-    for q, some in enumerate(_candidates(detections, places, aim, power, diffuse)):
+    for q, some in enumerate(_candidates(detections, positions, aim, power, diffuse)):
         best = some.cause()
         if best >= 0:
             cause[q], near[q] = some.path[best], some.near[best]
@@ -201,14 +203,14 @@ class _Candidates(NamedTuple):
 
 
 def _candidates(
-    detections: Detections, places: Places, aim: Aim, power: np.ndarray, diffuse: np.ndarray
+    detections: Detections, at: MapPositions, aim: Aim, power: np.ndarray, diffuse: np.ndarray
 ) -> list[_Candidates]:
     """List for each detection the paths that may have caused it; of the diffuse ones those within
     a cell."""
-    close = np.abs(detections.range[:, None] - places.range) <= places.cells[0] * (1 + 1e-9)
+    close = np.abs(detections.range[:, None] - at.range) <= at.cells[0] * (1 + 1e-9)
     q, path = np.nonzero(~diffuse | close)
-    some = places._replace(range=places.range[path], velocity=places.velocity[path])
-    row, column = some.apart(detections.range[q], detections.velocity[q])
+    some = at._replace(range=at.range[path], velocity=at.velocity[path])
+    row, column = some.distances(detections.range[q], detections.velocity[q])
     near, field = (row <= 1) & (column <= 1), diffuse[path]
     share = reach(row) * np.minimum(reach(column) + UNION_FLOOR, 1.0)
     off = np.abs(aim.direction[path] - detections.direction[q]) / aim.beam

@@ -18,7 +18,7 @@ from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.receive.cfar import STRONG, CfarRule, hann_envelope
 from isac_rt.receive.maps import UNION_FLOOR
 from isac_rt.receive.settings import Receivers
-from isac_rt.results.labels import Places, hann_response
+from isac_rt.results.labels import MapPositions, hann_response
 from isac_rt.world.swarm import Pose
 
 MATCHED_DB = 13.0
@@ -180,7 +180,7 @@ class Chance:
         cls,
         own: int,
         paths: PathSet,
-        places: Places,
+        positions: MapPositions,
         waveform: Waveform,
         sees: Sensitivity,
         channels: Channels,
@@ -190,13 +190,13 @@ class Chance:
         half = w.frame_duration / 2
         life = max(min(paths.end[own], half) - max(paths.begin[own], -half), 0.0) / (2 * half)
         beat = float(w.beat_cells(paths.delay[own], paths.delay_rate[own], 0.0))
-        doppler = places.velocity[own] / places.cells[1]
+        doppler = positions.velocity[own] / positions.cells[1]
         off = np.array([beat - round(beat), doppler - round(doppler)])
         off_grid = float(np.prod(hann_response(off)))
-        centre = np.array([places.range[own], places.velocity[own]]) - off * places.cells
+        centre = np.array([positions.range[own], positions.velocity[own]]) - off * positions.cells
         mine = power[own]
         diffuse = paths.kind == PathKind.DIFFUSE
-        clutter, background, masked = _around(own, places, power, diffuse, mine * off_grid, sees)
+        clutter, background, masked = _around(own, positions, power, diffuse, mine * off_grid, sees)
         cell = float(sees.cell * life**2 * mine * off_grid)
         every = cell * sees.rule.looks
         return cls(
@@ -205,7 +205,7 @@ class Chance:
             every,
             off_grid,
             every
-            * _whitened_share(own, centre, paths, places, sees, channels)
+            * _whitened_share(own, centre, paths, positions, sees, channels)
             * _beside_sight(own, paths, w, channels),
             sees.cell * clutter,
             background,
@@ -217,7 +217,7 @@ def _whitened_share(
     own: int,
     centre: np.ndarray,
     paths: PathSet,
-    places: Places,
+    positions: MapPositions,
     sees: Sensitivity,
     channels: Channels,
 ) -> float:
@@ -233,10 +233,10 @@ def _whitened_share(
     centre : range and velocity of the middle of its cell
     """
     city = (paths.kind == PathKind.DIFFUSE) | (paths.kind == PathKind.SPECULAR)
-    near = np.abs(places.range - centre[0]) < MAIN_LOBE * places.cells[0]
+    near = np.abs(positions.range - centre[0]) < MAIN_LOBE * positions.cells[0]
     some = np.flatnonzero(city & near)
-    beside = places._replace(range=places.range[some], velocity=places.velocity[some])
-    row, column = beside.apart(*centre)
+    beside = positions._replace(range=positions.range[some], velocity=positions.velocity[some])
+    row, column = beside.distances(*centre)
     some, row, column = (values[column < MAIN_LOBE] for values in (some, row, column))
     if not len(some):
         return 1.0
@@ -274,10 +274,10 @@ def _beside_sight(own: int, paths: PathSet, waveform: Waveform, channels: Channe
     x = np.where(np.abs(x) < 1e-6, 1e-6, x)
     line = np.sqrt(12) * (np.sinc(x) - np.cos(np.pi * x)) / (2 * np.pi * x)
     u = channels.rx.to_body(paths.arrival[both])
-    places = channels.antennas.rx_positions
-    constant = np.full((len(places), 1), len(places) ** -0.5)
-    basis = np.hstack([constant, orth(places - places.mean(axis=0))])
-    steering = np.exp(1j * channels.wavenumber * places @ (u[0] - u[1])) * constant[:, 0]
+    positions = channels.antennas.rx_positions
+    constant = np.full((len(positions), 1), len(positions) ** -0.5)
+    basis = np.hstack([constant, orth(positions - positions.mean(axis=0))])
+    steering = np.exp(1j * channels.wavenumber * positions @ (u[0] - u[1])) * constant[:, 0]
     of_receivers = np.abs(basis.T @ steering) ** 2
     taken = of_receivers.sum() * flat.prod() ** 2
     taken += of_receivers[0] * ((line[0] * flat[1]) ** 2 + (flat[0] * line[1]) ** 2)
@@ -286,7 +286,7 @@ def _beside_sight(own: int, paths: PathSet, waveform: Waveform, channels: Channe
 
 def _around(
     own: int,
-    places: Places,
+    positions: MapPositions,
     power: np.ndarray,
     diffuse: np.ndarray,
     in_cell: float,
@@ -302,12 +302,12 @@ def _around(
     in_cell : the path's power in its cell
     """
     guard, training = sees.rule.guard, sees.rule.training
-    off = places.range - places.range[own]
-    most = max(guard[0] + training[0] + 1, 2) * places.cells[0]
+    off = positions.range - positions.range[own]
+    most = max(guard[0] + training[0] + 1, 2) * positions.cells[0]
     some = np.flatnonzero(~diffuse | (np.abs(off) < most))
     off, level, field = off[some], power[some], diffuse[some]
-    near = places._replace(range=places.range[some], velocity=places.velocity[some])
-    row, column = near.apart(places.range[own], places.velocity[own])
+    near = positions._replace(range=positions.range[some], velocity=positions.velocity[some])
+    row, column = near.distances(positions.range[own], positions.velocity[own])
     beside = field & (row < MAIN_LOBE) & (column < MAIN_LOBE)
     clutter = level[beside] @ (hann_response(row[beside]) * hann_response(column[beside]))
     strong = ~field & (level > power[own])

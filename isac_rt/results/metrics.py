@@ -227,13 +227,13 @@ def binomial_interval(
     return low, high
 
 
-def within_view(antennas: Antennas, own: Pose, active: Pose, body: Pose) -> bool:
+def within_view(antennas: Antennas, own: Pose, active: Pose, uav: Pose) -> bool:
     """Return whether a target is in the field of view of the receiver and, unless it is the
     transmitter itself, of the transmitter."""
-    ends = [(own, body)]
-    if body is active:
+    ends = [(own, uav)]
+    if uav is active:
         ends.append((active, own))
     elif own is not active:
-        ends.append((active, body))
+        ends.append((active, uav))
     offsets = [(a, b.position - a.position) for a, b in ends]
     return all(bool(antennas.in_view(a.to_body(d / np.linalg.norm(d)))) for a, d in offsets)

@@ -11,7 +11,7 @@ import numpy as np
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
 from isac_rt.results.columns import TABLES
-from isac_rt.results.dataset import READ_LATE, Columns, Row, dataset_of, row_of, row_type
+from isac_rt.results.dataset import LATE_VARIABLES, Columns, Row, dataset_of, row_of, row_type
 from isac_rt.results.metrics import SymbolCount, decibels
 from isac_rt.results.provenance import versions_in_use
 from isac_rt.results.records import KINDS, FrameRecord, LateRecord
@@ -121,7 +121,7 @@ class Recorder:
         """Say of an earlier frame what became of its data."""
         table = self.tables["observer"][self.timetable.labels[link]]
         rows = table[late.frame]
-        for name in READ_LATE:
+        for name in LATE_VARIABLES:
             rows[name] = TABLES["observer"][name].read(late)
         table[late.frame] = rows
         self.amended.add(late.frame)

@@ -21,7 +21,7 @@ from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections, Reception
 from isac_rt.results.bounds import CramerRao
-from isac_rt.results.labels import Aim, Places, explain, owners
+from isac_rt.results.labels import Aim, MapPositions, explain, owners
 from isac_rt.results.losses import Chance, Channels, Sensitivity, cause_of
 from isac_rt.results.metrics import (
     GATE_RESOLUTIONS,
@@ -291,8 +291,8 @@ class Scorer(Stateful):
         follows, rows = np.full(len(tracks), -1), np.flatnonzero(tracks.confirmed)
         off = np.full((len(view.seen), len(rows)), np.inf)
         for i, (u, truth) in enumerate(view.seen.items()):
-            apart = np.linalg.norm(tracks.mean[rows, :3] - view.positions[u], axis=1)
-            near = (apart < GOSPA_CUTOFF_M) | (not all(self._resolution.observed))
+            distance = np.linalg.norm(tracks.mean[rows, :3] - view.positions[u], axis=1)
+            near = (distance < GOSPA_CUTOFF_M) | (not all(self._resolution.observed))
             off[i, near] = self._resolution.off(truth, tracks.measured[rows[near]])
         last = np.array([self.state.followed.get(i, -1) for i in view.seen], int)
         stays = (tracks.ids[rows] == last[:, None]) & (off < GATE_RESOLUTIONS)
@@ -324,13 +324,13 @@ class Scorer(Stateful):
     ) -> dict[int, Chance]:
         """Return the detection chance of the strongest straight path of each UAV seen."""
         w, out = self._timetable.waveform, {}
-        places = Places.of(paths, w, self._passes)
+        positions = MapPositions.of(paths, w, self._passes)
         wavenumber = 2 * np.pi * float(w.carrier()) / SPEED_OF_LIGHT
         channels = Channels(self._antennas, wavenumber, tx, view.pose)
         for i in view.seen:
             mine = np.flatnonzero(view.straight == i)
             own = int(mine[np.argmax(paths.power[mine])])
-            out[i] = Chance.of(own, paths, places, w, sees, channels)
+            out[i] = Chance.of(own, paths, positions, w, sees, channels)
         return out
 
     def _bound(self, view: _View, chances: dict[int, Chance]) -> UavValues:
@@ -344,7 +344,7 @@ class Scorer(Stateful):
     def _beside(self, truth: Truth, d: Detections) -> np.ndarray:
         """(Q,) which detections lie within a cell of a UAV."""
         w = self._timetable.waveform
-        rows, bins = Places.at(d.range, d.velocity, w, self._passes).apart(*truth[:2])
+        rows, bins = MapPositions.at(d.range, d.velocity, w, self._passes).distances(*truth[:2])
         return (rows <= 1) & (bins <= 1)
 
 

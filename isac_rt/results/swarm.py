@@ -130,19 +130,19 @@ class SwarmScorer(Stateful):
         found: np.ndarray,
         poses: Mapping[str, Pose],
     ) -> FusedRecord:
-        names, bodies = list(poses), view.fused
+        names, tracks = list(poses), view.fused
         truth = np.array([np.concatenate([p.position, p.velocity]) for p in poses.values()])
-        mean = np.array([b.state.mean for b in bodies]).reshape(-1, 6)
-        covariance = np.array([b.state.covariance for b in bodies]).reshape(-1, 6, 6)
+        mean = np.array([b.state.mean for b in tracks]).reshape(-1, 6)
+        covariance = np.array([b.state.covariance for b in tracks]).reshape(-1, 6, 6)
         seen = np.any([*seen_by.values()], axis=0)
-        rows = np.flatnonzero([b.terminal is None for b in bodies])
+        rows = np.flatnonzero([b.terminal is None for b in tracks])
         distance, false = score_tracks(mean[rows, :3], truth[:, :3], seen)
         off = self._off(mean[rows], seen_by, poses)
-        follows = np.full(len(bodies), -1)
+        follows = np.full(len(tracks), -1)
         error = np.full((len(names), len(ERRORS)), np.nan)
         for k, u in assigned(off, GATE_RESOLUTIONS):
             follows[rows[k]] = u
-            error[u] = _errors(bodies[rows[k]], truth[u])
+            error[u] = _errors(tracks[rows[k]], truth[u])
         return FusedRecord(
             gospa=np.array(distance[1:]),
             seen=seen,
@@ -153,13 +153,13 @@ class SwarmScorer(Stateful):
             reports=len(view.ages),
             age=float(np.mean(view.ages)) if view.ages else np.nan,
             **vars(view.traffic),
-            origin=np.array([self._origins.index(b.name.origin) for b in bodies], int),
-            number=np.array([b.name.number for b in bodies], int),
+            origin=np.array([self._origins.index(b.name.origin) for b in tracks], int),
+            number=np.array([b.name.number for b in tracks], int),
             mean=mean,
             std=np.sqrt(covariance.diagonal(axis1=1, axis2=2)),
-            members=np.array([len(b.members) for b in bodies], int),
+            members=np.array([len(b.members) for b in tracks], int),
             terminal=np.array(
-                [-1 if b.terminal is None else names.index(b.terminal) for b in bodies], int
+                [-1 if b.terminal is None else names.index(b.terminal) for b in tracks], int
             ),
             uav=follows,
         )
@@ -170,25 +170,25 @@ class SwarmScorer(Stateful):
         """(B, U) largest distance on any axis in resolutions of the link to which the state (B, 6)
         is nearest, of those that have the UAV in view; infinite where none has, and beyond the
         cutoff."""
-        places = np.array([pose.position for pose in poses.values()])
-        near = np.linalg.norm(states[:, None, :3] - places, axis=-1) < GOSPA_CUTOFF_M
+        positions = np.array([pose.position for pose in poses.values()])
+        near = np.linalg.norm(states[:, None, :3] - positions, axis=-1) < GOSPA_CUTOFF_M
         rows, out = np.flatnonzero(near.any(axis=1)), np.full(near.shape, np.inf)
-        bodies = [replace(Pose.at_rest(s[:3]), velocity=s[3:]) for s in states[rows]]
+        tracks = [replace(Pose.at_rest(s[:3]), velocity=s[3:]) for s in states[rows]]
         for link, seen in seen_by.items():
             own, at = poses[link.rx], None if link.own else poses[link.tx]
-            points = np.array([truth_of(own, b, at)[:4] for b in bodies]).reshape(-1, 4)
+            points = np.array([truth_of(own, b, at)[:4] for b in tracks]).reshape(-1, 4)
             for u in np.flatnonzero(seen):
                 truth = truth_of(own, [*poses.values()][u], at)
                 out[rows, u] = np.minimum(out[rows, u], self._resolutions[link].off(truth, points))
         return np.where(near, out, np.inf)
 
 
-def _errors(body: Fused, truth: np.ndarray) -> tuple[float, float, float]:
+def _errors(track: Fused, truth: np.ndarray) -> tuple[float, float, float]:
     """Errors of position [m] and velocity [m/s], and the squared error of position in the
     deviations stated, over its three axes."""
-    e = body.state.mean - truth
+    e = track.state.mean - truth
     position = e[:3]
-    nees = float(position @ np.linalg.solve(body.state.covariance[:3, :3], position)) / 3
+    nees = float(position @ np.linalg.solve(track.state.covariance[:3, :3], position)) / 3
     return float(np.linalg.norm(position)), float(np.linalg.norm(e[3:])), nees
 
 
@@ -212,7 +212,7 @@ def summary_of(
     return {**together, "terminals": of}
 
 
-def _block(frames: Columns, bodies: Columns, names: Sequence[str]) -> dict[str, Any]:
+def _block(frames: Columns, tracks: Columns, names: Sequence[str]) -> dict[str, Any]:
     """Summarise one set of fused tracks."""
     seen, found, tracked = frames["seen"], frames["found"], frames["tracked"]
     error, ages, reports = frames["error"][tracked], frames["age"], frames["reports"]
@@ -247,7 +247,7 @@ def _block(frames: Columns, bodies: Columns, names: Sequence[str]) -> dict[str, 
                 "in_view": int(seen[:, u].sum()),
                 "found": int(found[:, u].sum()),
                 "tracked": int(tracked[:, u].sum()),
-                "switches": _switches(bodies, u),
+                "switches": _switches(tracks, u),
             }
             for u, name in enumerate(names)
             if seen[:, u].any()
@@ -255,8 +255,8 @@ def _block(frames: Columns, bodies: Columns, names: Sequence[str]) -> dict[str, 
     }
 
 
-def _switches(bodies: Columns, u: int) -> int:
+def _switches(tracks: Columns, u: int) -> int:
     """Times that a UAV had another name than when it was tracked last."""
-    mine = bodies["uav"] == u
-    names = zip(bodies["origin"][mine].tolist(), bodies["number"][mine].tolist(), strict=True)
+    mine = tracks["uav"] == u
+    names = zip(tracks["origin"][mine].tolist(), tracks["number"][mine].tolist(), strict=True)
     return sum(a != b for a, b in pairwise(names))

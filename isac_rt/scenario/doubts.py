@@ -91,7 +91,7 @@ def _doubts_of_flights(scenario: Scenario) -> Iterator[Problem]:
         distances: dict[Key, float] = {}
         if uav.waypoints is None:
             speeds["swarm", name, "velocity_mps"] = math.hypot(*uav.velocity_mps)
-            distances["swarm", name, "position_m"] = math.dist(uav.place(0.0), centre)
+            distances["swarm", name, "position_m"] = math.dist(uav.position_at(0.0), centre)
         else:
             for i, (a, b) in enumerate(pairwise(uav.waypoints), start=1):
                 speed = math.dist(a.position_m, b.position_m) / (b.time_s - a.time_s)
@@ -118,7 +118,7 @@ def _middle(scenario: Scenario) -> tuple[float, float, float]:
     """The median of the places at which the swarm starts. [m]"""
     x, y, z = (
         median(axis)
-        for axis in zip(*(uav.place(0.0) for uav in scenario.swarm.values()), strict=True)
+        for axis in zip(*(uav.position_at(0.0) for uav in scenario.swarm.values()), strict=True)
     )
     return x, y, z
 

@@ -68,7 +68,7 @@ def _members(name: Any, uav: dict[str, Any]) -> dict[str, Any] | None:
     except ValueError:
         return None
     out = {}
-    for i, (right, front) in enumerate(formation.places(), start=1):
+    for i, (right, front) in enumerate(formation.positions(), start=1):
         east = right * ahead[1] + front * ahead[0]
         north = -right * ahead[0] + front * ahead[1]
         out[f"{name}_{i}"] = _moved(alone, east, north)

@@ -21,7 +21,7 @@ from isac_rt.settings import Key, Problem
 from isac_rt.world.settings import City
 
 if TYPE_CHECKING:
-    from isac_rt.world.city.place import Place
+    from isac_rt.world.city.georeference import GeoReference
 
 MAX_BYTES = 4_000_000
 MAX_ROWS = 20_000
@@ -169,54 +169,56 @@ def _flight(city: Any, folder: Path, path: Path) -> dict[str, Any]:
     some = [name for name in turned if name in c]
     if some and turned[0] not in some:
         raise ValueError(f"has {' and '.join(some)} without {turned[0]}; add it")
-    places = np.column_stack([c[name] for name in (xyz if "x" in c else degrees)])
+    positions = np.column_stack([c[name] for name in (xyz if "x" in c else degrees)])
     if "x" not in c:
-        places = _from_degrees(places, _place(city, folder))
-    elif np.abs(np.median(places[:, :2], axis=0)).max() > _GRID_M:
-        places = _from_grid(places, _place(city, folder), city)
+        positions = _from_degrees(positions, _georeference(city, folder))
+    elif np.abs(np.median(positions[:, :2], axis=0)).max() > _GRID_M:
+        positions = _from_grid(positions, _georeference(city, folder), city)
     out: list[dict[str, Any]] = [
-        {"time_s": time, "position_m": place}
-        for time, place in zip(c["time_s"], places.tolist(), strict=True)
+        {"time_s": time, "position_m": position}
+        for time, position in zip(c["time_s"], positions.tolist(), strict=True)
     ]
     for i, point in enumerate(out if some else ()):
         point["attitude_deg"] = [c[name][i] if name in c else 0.0 for name in turned]
     return {"waypoints": out}
 
 
-def _place(city: Any, folder: Path) -> Place | None:
+def _georeference(city: Any, folder: Path) -> GeoReference | None:
     """Return where a scenario's city lies, by its tree."""
-    from isac_rt.world.city.sources import city_place
+    from isac_rt.world.city.sources import city_georeference
 
     try:
         settings = None if city is None else City.model_validate(city)
     except ValidationError:  # told by whoever checks the scenario
         return None
-    return None if settings is None else city_place(settings, folder)
+    return None if settings is None else city_georeference(settings, folder)
 
 
-def _from_degrees(places: NDArray[np.float64], place: Place | None) -> NDArray[np.float64]:
+def _from_degrees(positions: NDArray[np.float64], geo: GeoReference | None) -> NDArray[np.float64]:
     """Latitude, longitude [degrees] and height [m] to world coordinates."""
-    if place is None or not place.crs:
+    if geo is None or not geo.crs:
         raise ValueError(
             "has latitude and longitude, and no map says where on Earth the world's origin lies; "
             "state x, y, z [m] from the origin, or city.crs with footprints"
         )
-    if np.abs(places[:, 0]).max() > 90:
+    if np.abs(positions[:, 0]).max() > 90:
         raise ValueError("has a latitude beyond 90 degrees; exchange lat and lon")
-    return place.from_degrees(places[:, [1, 0, 2]])
+    return geo.from_degrees(positions[:, [1, 0, 2]])
 
 
-def _from_grid(places: NDArray[np.float64], place: Place | None, city: Any) -> NDArray[np.float64]:
+def _from_grid(
+    positions: NDArray[np.float64], geo: GeoReference | None, city: Any
+) -> NDArray[np.float64]:
     """Metres of the grid of a city's file, such as UTM, to world coordinates; a city without an
     origin of its own lies in that grid too."""
     source = city.get("source") if isinstance(city, dict) else None
-    if (place is not None and place.plane) or source in ("builtin", "canyon", "blocks"):
-        where = "" if place is None else f", {place.words().removeprefix('world origin ')}"
+    if (geo is not None and geo.plane) or source in ("builtin", "canyon", "blocks"):
+        where = "" if geo is None else f", {geo.words().removeprefix('world origin ')}"
         raise ValueError(
-            f"lies {np.abs(places[0, :2]).max():.0f} m from the world's origin{where}, as in UTM; "
-            "state x, y, z [m] from the origin, or lat, lon, alt over a map"
+            f"lies {np.abs(positions[0, :2]).max():.0f} m from the world's origin{where}, as in "
+            "UTM; state x, y, z [m] from the origin, or lat, lon, alt over a map"
         )
-    return places if place is None else place.to_world(places)
+    return positions if geo is None else geo.to_world(positions)
 
 
 def _by_aspect(unit: str) -> Reader:
@@ -224,10 +226,10 @@ def _by_aspect(unit: str) -> Reader:
 
     def read(path: Path) -> dict[str, Any]:
         c = read_csv(path, ("azimuth_deg", "elevation_deg", unit))
-        places = list(zip(c["elevation_deg"], c["azimuth_deg"], strict=True))
-        values = dict(zip(places, c[unit], strict=True))
-        rows, columns = sorted({e for e, _ in places}), sorted({a for _, a in places})
-        if len(values) != len(places):
+        angles = list(zip(c["elevation_deg"], c["azimuth_deg"], strict=True))
+        values = dict(zip(angles, c[unit], strict=True))
+        rows, columns = sorted({e for e, _ in angles}), sorted({a for _, a in angles})
+        if len(values) != len(angles):
             raise ValueError("holds a direction twice")
         if len(values) != len(rows) * len(columns):
             raise ValueError(

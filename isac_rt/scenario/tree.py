@@ -365,13 +365,13 @@ class Scenario(Node):
                 (("swarm",),), "no UAV has the role active; give it to the one that transmits"
             )
         for (a, first), (b, second) in itertools.combinations(self.swarm.items(), 2):
-            apart = math.dist(first.place(0.0), second.place(0.0))
-            if apart < NEAREST_M:
+            distance = math.dist(first.position_at(0.0), second.position_at(0.0))
+            if distance < NEAREST_M:
                 key = "position_m" if second.waypoints is None else "waypoints"
                 yield Problem(
                     (("swarm", b, key), ("swarm", a)),
-                    f"{a} and {b} are {apart:.3g} m apart at the start, at least {NEAREST_M} m are "
-                    "needed; move one of them",
+                    f"{a} and {b} are {distance:.3g} m apart at the start, at least {NEAREST_M} m "
+                    "are needed; move one of them",
                 )
 
     def _role_problems(self) -> Iterator[Problem]:
@@ -590,7 +590,7 @@ class Scenario(Node):
                 if own != other:
                     yield Problem(
                         (("compare", name, "receivers", key), ("receivers", key)),
-                        f"every set hears the same samples, and receivers.{key} is {own}; "
+                        f"every set receives the same samples, and receivers.{key} is {own}; "
                         "leave it out",
                     )
 

@@ -1,2 +1,1 @@
-"""Paths and payload to IF samples, by several methods that are as exact as the scene needs, and the
-noise."""
+"""IF samples from paths and payload, by methods of different accuracy, and thermal noise."""

@@ -1,5 +1,4 @@
-"""PathSet, waveform and payload to IF samples: one interface to the exact model, the fast ones, and
-noise."""
+"""IF samples from paths, waveform and payload: the interface to all methods of synthesis."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ def if_signal(
     reference: Reference,
     method: Method = _AUTO,
 ) -> IFCube:
-    r"""Dechirped IF samples of one receiver in one frame, without noise.
+    r"""Synthesise the dechirped IF samples of one receiver in one frame, without noise.
 
     .. math::
 
@@ -30,10 +29,10 @@ def if_signal(
         \alpha\tau(u-\tau/2))}
 
     over paths and transmit groups m', with tau = data delay + path delay + clock + 2 (b' + m' - b -
-    m) T_d + element delays (notes, section 2), b' and b the first resource blocks of the
+    m) T_d + element delays, b' and b the first resource blocks of the
     transmitter and of the receiver's reference; h is the IF filter. A farther target has a higher
     fast-time frequency, a receding one a positive slow-time frequency; a wave from body direction u
-    turns element r by exp(-j 2 pi f r.u/c).
+    has the phase factor exp(-j 2 pi f r.u/c) at element r.
 
     Parameters
     ----------
@@ -42,8 +41,8 @@ def if_signal(
         without unit
     receiver : ReceiveArray
     reference : Reference
-    method : how: `Auto` (the default), `Exact`, `Direct`, `Gridded` or `Separable`, of
-        `isac_rt.signal.methods`
+    method : `Auto` (the default), `Exact`, `Direct`, `Gridded` or `Separable`
+        (`isac_rt.signal.methods`)
 
     Returns
     -------
@@ -52,16 +51,16 @@ def if_signal(
     Raises
     ------
     ValueError
-        If a path set belongs to another slot than the one in the middle of the frame, there is no
-        link and no schedule, or the waveform is a receiver's view of some groups.
+        If the epoch of a path set is a slot or more from mid-frame, there is neither link nor
+        schedule, or the waveform has some groups only.
 
     Notes
     -----
-    Not modelled: motion during the flight of light; the turning of directions within a frame
-    (element phases err by 2 pi v r t / (R lambda), 0.03 rad at an outer element for 10 m/s across
-    at 30 m). Spherical wavefronts enter at both ends by their radii, jointly for lines of sight;
-    for folded paths the joint term r_tx.r_rx/L of the perpendicular offsets is left out (5e-6 m,
-    0.01 rad at 30 m), as it is for lines of sight in `Gridded`.
+    Not modelled: motion during the flight of light, and the change of directions within a frame (a
+    phase error of 2 pi v r t / (R lambda), 0.03 rad at an outer element for 10 m/s across at 30 m).
+    Wavefronts are spherical at both ends, jointly for lines of sight; for other paths, and for
+    lines of sight in `Gridded`, the joint term r_tx.r_rx/L of the perpendicular offsets is omitted
+    (5e-6 m, 0.01 rad at 30 m).
 
     Examples
     --------
@@ -97,7 +96,8 @@ def noisy_if_signal(
     method: Method,
     noise: WhiteNoise,
 ) -> IFCube:
-    """`if_signal` with what `add_noise` would add, to the bit, while samples are in the cache."""
+    """Return `if_signal` with the noise of `add_noise`, bit for bit, added while samples are in
+    the cache."""
     schedule, tones = received_tones(waveform, links, receiver, reference)
     return IFCube(
         samples=method.samples(waveform, tones, noise),
@@ -123,7 +123,7 @@ def add_noise(cube: IFCube, power: float, seed_words: np.ndarray) -> IFCube:
 def received_tones(
     waveform: Waveform, links: Links, receiver: ReceiveArray, reference: Reference
 ) -> tuple[Schedule, Tones]:
-    """Schedule of the reference chirps, and what is received in them."""
+    """Return the schedule of the reference chirps and the tones received in them."""
     schedule, first_block = reference.schedule, reference.first_block
     if schedule is None:
         if not links:

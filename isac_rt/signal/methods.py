@@ -1,6 +1,4 @@
-"""The methods of synthesis as values: each holds its own numbers and makes samples of tones and
-noise.
-"""
+"""Methods of IF synthesis: each is a value that turns tones and noise into samples."""
 
 from __future__ import annotations
 
@@ -23,7 +21,7 @@ from isac_rt.signal.tones import Tones
 
 def separable(waveform: Waveform, tones: Tones) -> np.ndarray:
     r"""Return samples (M, L_rx, P, N) complex128 by the paper's separable model, which its
-    receivers assume; groups do not receive each other, paths live for the whole frame.
+    receivers assume: no reception between groups, paths that last for the whole frame.
 
     .. math::
 
@@ -31,27 +29,27 @@ def separable(waveform: Waveform, tones: Tones) -> np.ndarray:
         f_c\dot\tau p\bar T}
 
     with tau_0 the delay at the frame's start, f_tau = alpha T tau_0 and f_D the data in range
-    cells, tau_l the elements' delays at the carrier alone. Left out (notes, section 2): Doppler
-    within a chirp, migration, the groups' offsets in time, the elements' delay of the modulation,
-    and the four phases that data turn. The relative RMS against the exact model is 0.042 at 0.5 m/s
-    and 0.91 at 15 m/s for an echo, and 1 once there are data.
+    cells, tau_l the elements' delays at the carrier alone. Omitted are Doppler within a chirp,
+    range migration, the time offsets of groups, the elements' delay of the modulation, and the
+    phase terms of the data delay. The relative RMS error against the exact model is 0.042 at 0.5
+    m/s and 0.91 at 15 m/s for an echo, and 1 with data.
     """
     w, t = waveform, tones
     start = t.delay - t.rate * w.frame_duration / 2
-    fast, slots = (
-        np.arange(w.num_samples) * w.sample_interval,
-        np.arange(w.num_chirps) * w.slot_duration,
-    )
+    fast = np.arange(w.num_samples) * w.sample_interval
+    slots = np.arange(w.num_chirps) * w.slot_duration
     out = np.zeros((w.num_groups, t.rx_delay.shape[1], w.num_chirps, w.num_samples), np.complex128)
     for k in range(t.size):
         q = t.link[k]
         for m in range(w.num_groups):
-            whole = start[k] + t.symbol_delay[q, m]
+            whole = start[k] + t.symbol_delay[q, m]  # tau_0 + data delay, by chirp
             weight = t.factor[k] * t.send[q, m] * filter_gain(w, w.slope * whole)
+            # slow time: carrier phase of tau_0, of the transmit element and of the Doppler
             carrier = (
                 w.carrier_frequency
                 * (start[k] + t.tx_delay[k, t.antenna[q, m]] + t.rate[k] * slots)
             ) % 1
+            # fast time: beat frequency, f_tau + f_D
             beat = (
                 np.exp(2j * np.pi * ((w.slope * whole[:, None] * fast) % 1))
                 * (weight * np.exp(2j * np.pi * carrier))[:, None]
@@ -61,20 +59,19 @@ def separable(waveform: Waveform, tones: Tones) -> np.ndarray:
 
 
 ERROR_AT_REST, ERROR_PER_SPEED = 5e-5, 1e-6
-"""Bound of the relative RMS error of a gridded path against the exact model, at rest, and more for
-each m/s of c/2 times its delay rate; up to direction cosines of 0.87 and 640 MHz (measured:
-tests/signal/test_gridding.py)."""
+"""Bound of the relative RMS error of a gridded path at rest, and its increase per m/s of c/2 times
+the delay rate; up to direction cosines of 0.87 and 640 MHz (tests/signal/test_gridding.py)."""
 GRID_PATHS = 150
-"""Paths times receive elements whose tones take as long one by one as one grid of sixteen elements
-(100 to 250, by processor)."""
+"""Paths times blocks of 16 receive elements at which direct sums take as long as the grid (100 to
+250 by processor)."""
 MAX_CELLS = 1 << 24
-"""Span of cells whose sums are kept as one array: a hundred times what a link spans. Transmitters
-whose clocks are a second apart span 10^11."""
+"""Largest span of cells that is summed in one array, a hundred times that of a link. Clocks that
+differ by a second span 10^11."""
 
 
 @dataclass(frozen=True)
 class Exact:
-    """Float64 per path and sample: the truth that the fast methods are held against.
+    """Float64 sum per path and sample: the reference of the fast methods.
 
     Examples
     --------
@@ -117,7 +114,7 @@ class Separable:
 
 @dataclass(frozen=True)
 class Direct:
-    """Path by path in float32 sums: relative error 1e-6, time in proportion to the paths."""
+    """Path by path in float32 sums: relative error 1e-6, time proportional to the paths."""
 
     name: ClassVar[str] = "direct"
 
@@ -129,8 +126,9 @@ class Direct:
 
 @dataclass(frozen=True)
 class Gridded:
-    """All paths through a grid of frequencies, for many: relative error `GRIDDED_ERROR`, or as if
-    noise covered all (`faint`: `isac_rt.kernels.signal_below_noise.below_noise_error`)."""
+    """Non-uniform FFT over a grid of beat frequencies, for many paths: relative error
+    `GRIDDED_ERROR`, or that of below-noise paths (`faint`:
+    `isac_rt.kernels.signal_below_noise.below_noise_error`)."""
 
     name: ClassVar[str] = "gridded"
     faint: bool = False
@@ -143,41 +141,41 @@ class Gridded:
 
 @dataclass(frozen=True)
 class Auto:
-    """Few paths one by one, many through a grid of frequencies, and of those some one by one.
+    """Choose a method for each path: `Direct` for few paths, else `Gridded` for most.
 
-    One by one go lines of sight (their joint curvature is not gridded); paths too fast for
-    `GRIDDED_ERROR`; and of those whose error, integrated coherently over the cube, could exceed the
-    noise of a cell (power error^2 size > noise_power), the `max_direct` strongest. Paths that noise
-    covers take a faster way with a larger error: all of a range-Doppler cell together keep it under
-    `covered` times the noise, integrated coherently over the cube.
+    Of many paths `Direct` makes lines of sight (the grid omits their joint curvature), paths too
+    fast for `GRIDDED_ERROR`, and the `max_direct` strongest of those whose error, integrated
+    coherently over the cube, could exceed the noise of a cell (power error^2 size > noise_power).
+    Below-noise paths take a faster grid with a larger error: integrated likewise and summed over a
+    range-Doppler cell, it stays under `below_noise` times the noise.
 
     Attributes
     ----------
-    noise_power : per complex sample [W]; with 0 the `max_direct` strongest paths go one by one
-    max_direct : paths that go one by one for their strength, at the most
-    covered : error that noise covers, over the noise of a cell of all elements and chirps; 0: no
-        path is taken for covered
+    noise_power : per complex sample [W]; with 0 the `max_direct` strongest paths are made directly
+    max_direct : most paths that are made directly for their power
+    below_noise : error of below-noise paths over the noise of a cell of all elements and chirps;
+        0: no path is below noise
     """
 
     name: ClassVar[str] = "auto"
     noise_power: float = 0.0
     max_direct: int = 16
-    covered: float = 0.0
+    below_noise: float = 0.0
 
     def samples(self, waveform: Waveform, tones: Tones, noise: WhiteNoise = SILENCE) -> np.ndarray:
         """(M, L_rx, P, N) complex64."""
         return _made(waveform, tones, noise, *self.choose(waveform, tones))
 
     def choose(self, waveform: Waveform, tones: Tones) -> tuple[np.ndarray, np.ndarray]:
-        """Return which paths are synthesised one by one, and which of the others are below the
-        noise, (K,) bool each."""
+        """Mark the paths for `Direct`, and those of the others that are below noise: (K,) bool
+        each."""
         every, elements = np.ones(tones.size, bool), tones.rx_delay.shape[1]
         size = float(np.prod(_shape(waveform, tones)))
         error = ERROR_AT_REST + ERROR_PER_SPEED * tones.speed(waveform.frame_duration)
         strong = tones.power * error**2 * size > self.noise_power
         faint = ~every
-        if self.covered and tones.size:
-            limit = self.covered * self.noise_power / size
+        if self.below_noise and tones.size:
+            limit = self.below_noise * self.noise_power / size
             faint = ~tones.sight & _below_noise(waveform, tones, limit)
         top = _strongest(tones.power, self.max_direct)
         alone = ~faint & ((strong & top) | tones.sight | (error > GRIDDED_ERROR))
@@ -190,7 +188,7 @@ Method = Exact | Direct | Gridded | Auto | Separable
 
 
 def _strongest(power: np.ndarray, count: int) -> np.ndarray:
-    """Mark the `count` strongest (K,) of some powers; of equal ones the first."""
+    """Mark the `count` largest powers (K,), the first of equal ones."""
     out = np.zeros(power.size, bool)
     out[np.argsort(-power, kind="stable")[:count]] = True
     return out
@@ -202,8 +200,8 @@ def _shape(waveform: Waveform, tones: Tones) -> tuple[int, ...]:
 
 
 def _below_noise(waveform: Waveform, tones: Tones, limit: float) -> np.ndarray:
-    """Mark the paths (K,) below the noise: the powers [W] of the errors that all paths of their
-    range-Doppler cell would have stay within a limit."""
+    """Mark the below-noise paths (K,): the error power of all paths of their range-Doppler cell
+    stays within `limit` [W]."""
     error = below_noise_error(waveform, tones, grid_size(waveform.num_samples, OVERSAMPLING, WIDTH))
     cell = resolution_cell(waveform, tones.delay, tones.rate)
     number = cell - cell.min()

@@ -1,4 +1,4 @@
-"""Paths as flat arrays of tones: what every method of synthesis starts from."""
+"""Paths as flat arrays of tones, the input of all methods of synthesis."""
 
 from __future__ import annotations
 
@@ -18,25 +18,24 @@ _CHUNK = 1024  # paths whose element delays stay in the second-level cache
 
 
 class Tones(NamedTuple):
-    """K paths of Q links as arrays, which compiled code takes as they are. Times are seconds since
-    the middle of the frame.
+    """K paths of Q links as arrays for kernels. Times are in seconds from mid-frame.
 
     Attributes
     ----------
     link : (K,) int64
-    sight : (K,) bool, whether it is a line of sight
+    sight : (K,) bool, lines of sight
     power : (K,) received power [W]
     factor : (K,) complex128, conj(path gain)
     delay, rate, accel : (K,) float64, the clock of the transmitter included
-    begin, end : (K,) when the path lives
-    tx_delay, rx_delay : (K, L_tx), (K, L_rx) what an element adds to the delay [s]
+    begin, end : (K,) interval in which the path exists
+    tx_delay, rx_delay : (K, L_tx), (K, L_rx) delay of each element [s]
     cross_row : (K,) int64 row of `cross`
     cross : (R, L_tx, L_rx) joint part of the element delays [s]; row 0 is zero
     symbol_delay : (Q, M, P) delay of the data [s]
     send : (Q, M, P) complex128, amplitude times DPSK phase, zero where nothing is sent
     antenna : (Q, M, P) int64 transmit element
-    tx_gain, rx_gain : (K, L_tx), (K, L_rx) complex128, factor of each path at an element, or
-        `NO_GAIN` where all are 1
+    tx_gain, rx_gain : (K, L_tx), (K, L_rx) complex128, gain of each path at an element;
+        `NO_GAIN`: 1
     """
 
     link: np.ndarray
@@ -64,7 +63,7 @@ class Tones(NamedTuple):
         return self.delay.shape[0]
 
     def select(self, which: np.ndarray) -> Tones:
-        """The paths that a mask or an index array chooses."""
+        """Select paths by a mask or an index array."""
         shared = ("cross", "symbol_delay", "send", "antenna")
         rows = np.flatnonzero(which) if np.asarray(which).dtype == bool else which
         return self._replace(
@@ -76,8 +75,8 @@ class Tones(NamedTuple):
         )
 
     def sources(self, waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
-        """Find which (path, offset = m - m') can pass the filter in some chirp: indices into the
-        paths, and offsets. Both (C,) int64."""
+        """Return the pairs (path, offset = m - m') that pass the filter in some chirp: indices of
+        the paths, and offsets, (C,) int64 each."""
         w, t = waveform, self
         half = w.frame_duration / 2 + w.chirp_duration + w.num_groups * w.group_spacing
         motion = np.abs(t.rate) * half + np.abs(t.accel) * half**2 / 2
@@ -94,15 +93,15 @@ class Tones(NamedTuple):
         return np.concatenate(paths), np.concatenate(offsets).astype(np.int64)
 
     def speed(self, duration: float) -> np.ndarray:
-        """c/2 times the largest rate of each delay in a frame of this `duration` (K,) [m/s]."""
+        """Return c/2 times the largest delay rate of each path in a frame (K,) [m/s]."""
         return (np.abs(self.rate) + np.abs(self.accel) * duration / 2) * (SPEED_OF_LIGHT / 2)
 
 
 def tones_of(
     waveform: Waveform, links: Links, receiver: ReceiveArray, middle: float, first_block: int
 ) -> Tones:
-    """All links' paths at a receiver whose frame has its middle at `middle` [s] and whose reference
-    chirps begin in block `first_block`."""
+    """Return the tones of all links at a receiver with mid-frame `middle` [s] and reference chirps
+    from resource block `first_block` on."""
     w = waveform
     links = [(stream, paths) for sent, paths in links for stream in sent.streams()]
     rx = receiver.pose.to_world(receiver.antennas.rx_positions)
@@ -116,7 +115,7 @@ def tones_of(
         | {"cross": np.zeros((1, num_tx, len(rx))), "symbol_delay": np.zeros((0, *grid))}
         | {"send": np.zeros((0, *grid), complex), "antenna": np.zeros((0, *grid), np.int64)}
     ]
-    rows = 1
+    rows = 1  # of `cross`
     for q, (t, s) in enumerate(links):
         tx = np.zeros((num_tx, 3))
         tx[: t.antennas.num_tx] = t.pose.to_world(t.antennas.tx_positions)
@@ -125,10 +124,12 @@ def tones_of(
         row = np.zeros(len(s), np.int64)
         row[near] = rows + np.arange(near.size)
         rows += near.size
+        # far-field or spherical delays of the elements; lines of sight jointly for both arrays
         tx_delay = _element_delay(tx, s.departure, s.tx_radius)
         rx_delay = _element_delay(rx, s.arrival, s.rx_radius)
         joint = _straight_delay(tx, rx, s.departure[near], s.rx_radius[near])
-        later = middle - s.epoch  # blocks start at different times of a slot, the epoch is one
+        # from the epoch of the paths to mid-frame
+        later = middle - s.epoch
         moved = s.delay + (s.delay_rate + s.delay_accel * later / 2) * later
         parts.append(
             {
@@ -156,7 +157,7 @@ def tones_of(
 
 
 def _element_delay(elements: np.ndarray, direction: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """(|R u - r| - R)/c, and -r.u/c where R is infinite: (K, L) [s], free of cancellation."""
+    """Return (|R u - r| - R)/c, or -r.u/c for infinite R: (K, L) [s], without cancellation."""
     along = direction @ elements.T
     out = along * (-1 / SPEED_OF_LIGHT)
     square = (elements**2).sum(1)
@@ -176,7 +177,8 @@ def _element_delay(elements: np.ndarray, direction: np.ndarray, radius: np.ndarr
 def _straight_delay(
     tx: np.ndarray, rx: np.ndarray, direction: np.ndarray, length: np.ndarray
 ) -> np.ndarray:
-    """(|L d + r_rx - r_tx| - L)/c of straight paths: (K, L_tx, L_rx) [s], free of cancellation."""
+    """Return (|L d + r_rx - r_tx| - L)/c of straight paths (K, L_tx, L_rx) [s], without
+    cancellation."""
     offset = rx[None, :] - tx[:, None]
     along = np.einsum("trx,kx->ktr", offset, direction)
     change = 2 * length[:, None, None] * along + (offset**2).sum(2)

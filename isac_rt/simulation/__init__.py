@@ -1,1 +1,1 @@
-"""From a scenario to results: set-up, plan, the loop over the frames, and going on after a stop."""
+"""Simulation of a scenario: set-up, plan, the loop over frames, and resuming."""

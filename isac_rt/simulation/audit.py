@@ -1,12 +1,11 @@
-"""The budget before a run and after it: what will be left out, estimated from a few frames, and
-what was, against the full model.
+"""Error budget of a run: estimates before it from a few frames, and measured errors against the
+full model.
 
-Estimates come from `PILOT_FRAMES` frames of the run, spread over it, with a margin for the others
-and the plan's own limits as ceilings. The truth is measured on other frames, drawn at random: every
-one of them is traced in full, with spherical wavefronts of all elements, with every UAV where its
-trajectory puts it at the ends of the frame, and with the direct synthesis. Paths that were missed
-are those that Sionna's own solver finds with `CHECK_RAYS`.
-"""
+Estimates come from `PILOT_FRAMES` frames, spread over the run, with a margin for the others, and
+are limited by the bounds of the plan. Errors are measured on other frames, drawn at random, by the
+full model: all paths, spherical wavefronts of all elements, the true positions at the ends of the
+frame, and direct synthesis. Missed paths are those that Sionna's own solver finds with `CHECK_RAYS`
+in addition."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.kernels.signal_gridded import GRIDDED_ERROR
 from isac_rt.propagation.clutter.cells import Density, error_for
-from isac_rt.propagation.clutter.merging import apart_db, resolution_cell
+from isac_rt.propagation.clutter.merging import difference_db, resolution_cell
 from isac_rt.propagation.clutter.rayleigh import RayleighClutter
 from isac_rt.propagation.legs.geometry import plane_of_each_face, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet
@@ -60,12 +59,12 @@ _LOG = logging.getLogger(__name__)
 PILOT_FRAMES = 5
 CHECK_RAYS = 300_000
 POWER_MARGIN = 10.0
-"""Estimates of power over the largest of the pilot frames; 3.2 in amplitude."""
+"""Margin of power estimates over the largest of the pilot frames (3.2 in amplitude)."""
 PHASE_MARGIN = 2.0
 MOST_COMPARED = 150
-"""Paths of a frame whose synthesis is compared with the direct one."""
+"""Most paths of a frame whose synthesis is compared with the direct one."""
 SAME_DELAY = 1e-14
-"""Paths of two traces that are one [s]: 3 um, 5 mrad at 77 GHz."""
+"""Largest difference of delay between equal paths of two traces [s]: 3 um, 5 mrad at 77 GHz."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ class Item:
 
 
 def tracer_of(setup: Setup) -> RayTracer | None:
-    """The ray tracer of a set-up; None in free space."""
+    """Return the ray tracer of a set-up; None in free space."""
     if setup.scenario.propagation.model != "ray_traced":
         return None
     from isac_rt.propagation.raytrace import RayTracer
@@ -104,14 +103,14 @@ def tracer_of(setup: Setup) -> RayTracer | None:
 
 
 def _spread(values: Sequence[int], count: int) -> list[int]:
-    """At most `count` of some values, evenly spread, first and last among them."""
+    """Select at most `count` values, evenly spread, with the first and the last."""
     index = np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).round().astype(int))
     return [values[i] for i in index]
 
 
 def make_plan(setup: Setup) -> dict[str, Any]:
-    """The plan of a run: its decisions, and one item per line with the estimated error. Traces a
-    few frames."""
+    """Return the plan of a run: its decisions, and one `Item` per effect with the estimated error.
+    Traces a few frames."""
     plan = setup.plan
     frames = _spread(range(plan.timetable.frames), PILOT_FRAMES)
     uses: dict[Link, list[Use]] = {}
@@ -144,19 +143,20 @@ def make_plan(setup: Setup) -> dict[str, Any]:
 
 
 def _next_slot(setup: Setup) -> float:
-    """`next_slot_delay` of the run's blocks [s]."""
+    """Return `next_slot_delay` of the run's blocks [s]."""
     blocks = [b for b in setup.timetable.blocks.values() if b is not None] or [0]
     return next_slot_delay(setup.waveform, blocks)
 
 
 def _late(setup: Setup, paths: PathSet, noise_power: float) -> float:
-    """Power of the paths whose chirps reach the next slot, over the noise of a cell."""
+    """Return the power of the paths whose chirps reach the next slot, over the noise of a cell."""
     power = float(paths.power[paths.delay >= _next_slot(setup)].sum())
     return power * setup.plan.cell_noise_gain() / noise_power
 
 
 def _standing_items(setup: Setup, light: float, late: float, short_lived: float) -> list[Item]:
-    """Lines of what no run models: phases [rad], power over the noise of a cell, paths a frame."""
+    """Return the items of effects that no run models: phases [rad], power over the noise of a cell,
+    paths per frame."""
     limit = f"paths longer than {_next_slot(setup) * SPEED_OF_LIGHT:.0f} m"
     out = [
         Item("motion during the flight of light", "no", "always", light, "rad"),
@@ -170,8 +170,8 @@ def _standing_items(setup: Setup, light: float, late: float, short_lived: float)
 
 
 def _hardware_items(frame: Frame) -> list[Item]:
-    """A line for each part of the hardware of each link that is not ideal, with the noise of
-    oscillators that is left out of the paths."""
+    """Return an item for each non-ideal hardware part of each link, with the oscillator noise that
+    is omitted."""
     out = []
     for link in frame.paths:
         ends = frame.ends(link)
@@ -186,7 +186,7 @@ def _hardware_items(frame: Frame) -> list[Item]:
 
 
 def _self_calibration_items(s: Setup, frame: Frame) -> list[Item]:
-    """A line for each link whose receiver calibrates itself."""
+    """Return an item for each link with a self-calibrating receiver."""
     if s.scenario.receivers.self_calibration == "none":
         return []
     said = f"elements, chirp and clocks ({s.scenario.receivers.self_calibration})"
@@ -195,8 +195,8 @@ def _self_calibration_items(s: Setup, frame: Frame) -> list[Item]:
 
 
 def missed_per_frame(setup: Setup, frames: Sequence[int]) -> float:
-    """Paths of a frame over `MATTERS_DB` that are missed, all links together, as some frames let
-    it be expected (`isac_rt.simulation.plan`)."""
+    """Estimate the missed paths per frame over `MATTERS_DB`, of all links, from some frames
+    (`isac_rt.simulation.plan`)."""
     tracer = tracer_of(setup)
     assert tracer is not None
     alone, weak, strong = 0, 0, 0
@@ -215,7 +215,7 @@ def missed_per_frame(setup: Setup, frames: Sequence[int]) -> float:
 
 
 def _over(paths: PathSet, level: float, decibels: float) -> PathSet:
-    """The paths over a level by so much."""
+    """Select the paths over a level."""
     return paths.select(paths.power > level * 10 ** (decibels / 10))
 
 
@@ -231,7 +231,7 @@ def _tracing_item(setup: Setup, frames: Sequence[int]) -> Item:
 
 
 def _scene_items(setup: Setup) -> list[Item]:
-    """Lines of the mesh and of its scatterers, with the reason for each count."""
+    """Return the items of the mesh and its scatterers."""
     out, record = [], extent(setup.city, setup.propagation.census(), setup.scenario.clutter)
     faces, gone = record["city_faces"], record["city_faces_beyond_reach"]
     if faces + gone:
@@ -246,16 +246,16 @@ def _scene_items(setup: Setup) -> list[Item]:
         why += f"; {again:.0f} m2 that lie twice, for surfaces overlap" if again else ""
         out.append(Item("clutter field", said, f"{hidden} {why}", error, "dB of a cell's mean"))
         for link, left in record["merged"].items():
-            covered = f"{count - left} merged under noise or out of sight"
+            below_noise = f"{count - left} merged under noise or out of sight"
             kept, unit = f"{left} scatterers", "dB of noise and clutter"
-            out.append(Item("clutter of the link", kept, covered, error, unit, link))
+            out.append(Item("clutter of the link", kept, below_noise, error, unit, link))
         out.append(_mirrors_item(record["mirrors"]))
     return out
 
 
 def _mirrors_item(record: dict[str, dict[str, Any]] | None) -> Item:
-    """The line of two-bounce clutter: mirrors by terminal, and what the mirrors left out would have
-    sent on."""
+    """Return the item of two-bounce clutter: mirrors by terminal, and the power of the omitted
+    ones."""
     what = "clutter by mirrors"
     if record is None:
         return Item(what, "one bounce", "two bounces (clutter.mirrors)")
@@ -271,7 +271,7 @@ def _mirrors_item(record: dict[str, dict[str, Any]] | None) -> Item:
 
 
 def _link_items(setup: Setup, link: Link, uses: list[Use]) -> list[Item]:
-    """Lines of one link."""
+    """Return the items of one link."""
     name, share = str(link), setup.plan.phase_share
     mean = {
         key: float(np.mean([getattr(use, key) for use in uses]))
@@ -323,8 +323,8 @@ def _link_items(setup: Setup, link: Link, uses: list[Use]) -> list[Item]:
 
 
 def check(setup: Setup, frames: int = 4) -> dict[str, Any]:
-    """The true errors on frames drawn at random, link by link: the largest of them beside the
-    largest bound of the same frames."""
+    """Measure the errors of each link on frames drawn at random: the largest error and the largest
+    bound of these frames."""
     rng, count = generator(setup.scenario.seed, "budget check"), setup.timetable.frames
     chosen = sorted(rng.choice(count, min(frames, count), replace=False).tolist())
     tracer = tracer_of(setup)
@@ -343,7 +343,7 @@ def check(setup: Setup, frames: int = 4) -> dict[str, Any]:
 
 
 def _in_decibels(row: dict[str, float]) -> dict[str, float | None]:
-    powers = ("left_out", "left_out_bound", "missed_strongest", "covered", "covered_bound")
+    powers = ("left_out", "left_out_bound", "missed_strongest", "below_noise", "below_noise_bound")
     return {
         (f"{key}_db" if key in powers else key): (decibels(value) if key in powers else value)
         for key, value in row.items()
@@ -353,7 +353,7 @@ def _in_decibels(row: dict[str, float]) -> dict[str, float | None]:
 def _errors(
     setup: Setup, frame: Frame, link: Link, found: PathSet, full: PathSet
 ) -> dict[str, float]:
-    """True errors of one link and frame; powers are over the noise of a cell."""
+    """Measure the errors of one link and frame; powers are over the noise of a cell."""
     plan, level = setup.plan, frame.noise_power(link)
     kept, use = frame.paths[link], frame.uses[link]
     ratio = plan.cell_noise_gain() / level
@@ -377,13 +377,13 @@ def _errors(
         "turning_rad": _turning_error(setup, frame.number, kept),
         "turning_bound_rad": use.turning_error,
         "synthesis": _synthesis_error(setup, frame, link, level),
-        "covered": _below_noise_error(setup, frame, link, level),
-        "covered_bound": plan.covered,
+        "below_noise": _below_noise_error(setup, frame, link, level),
+        "below_noise_bound": plan.below_noise,
     }
 
 
 def present(paths: PathSet, among: PathSet) -> np.ndarray:
-    """(K,) whether each path is one of the others: same kind, same UAV, same delay."""
+    """Mark the paths (K,) that are among the others, with the same kind, UAV and delay."""
     out = np.zeros(len(paths), bool)
     for kind, target in {(int(k), int(t)) for k, t in zip(paths.kind, paths.target, strict=True)}:
         here = np.flatnonzero((paths.kind == kind) & (paths.target == target))
@@ -399,8 +399,8 @@ def present(paths: PathSet, among: PathSet) -> np.ndarray:
 
 
 def _plane_error(setup: Setup, frame: Frame, link: Link, raw: PathSet) -> float:
-    """Largest phase by which the kept wavefronts that are plane differ from point sources' [rad],
-    both ends added."""
+    """Return the largest phase error of plane wavefronts against spherical ones [rad], both ends
+    added."""
     plane = np.isinf(frame.paths[link].rx_radius) & np.isfinite(raw.rx_radius)
     if not plane.any():
         return 0.0
@@ -421,8 +421,8 @@ def _plane_error(setup: Setup, frame: Frame, link: Link, raw: PathSet) -> float:
 
 
 def _clutter_error(setup: Setup, frame: Frame, link: Link) -> float:
-    """Error of mean noise plus clutter that nine of ten range-Doppler cells keep to, of those that
-    hold clutter [dB]: scatterers merged against all."""
+    """Return the 90th percentile of the error of mean noise plus clutter by merging, over
+    range-Doppler cells with clutter [dB]."""
     tracer = tracer_of(setup)
     if tracer is None or tracer.field is None or link not in tracer.field.merged:
         return 0.0
@@ -449,8 +449,8 @@ def clutter_by_cell(
 
 
 def cells_apart(every: tuple[np.ndarray, np.ndarray], some: tuple[np.ndarray, np.ndarray]) -> float:
-    """Error of mean noise plus clutter that nine of ten cells keep to, of those that hold any [dB];
-    two results of `clutter_by_cell`."""
+    """Return the 90th percentile of the difference of mean noise plus clutter between two results
+    of `clutter_by_cell`, over cells with clutter [dB]."""
     cells, powers = zip(every, some, strict=True)
     _, number = np.unique(np.concatenate(cells), return_inverse=True)
     count = number.max(initial=-1) + 1
@@ -460,12 +460,12 @@ def cells_apart(every: tuple[np.ndarray, np.ndarray], some: tuple[np.ndarray, np
         np.bincount(part, power, count)
         for part, power in zip(np.split(number, [len(cells[0])]), powers, strict=True)
     )
-    return float(np.quantile(apart_db(a, b), 0.9))
+    return float(np.quantile(difference_db(a, b), 0.9))
 
 
 def _flight_error(setup: Setup, frame: int, kept: PathSet) -> float:
-    """Largest phase by which the kept delays differ at the ends of the frame from those over the
-    true positions there [rad]."""
+    """Return the largest phase error of the extrapolated delays at the ends of the frame, against
+    the true positions [rad]."""
     reach, epoch = frame_reach(setup.waveform), setup.timetable.epoch(frame)
     moving = _with_chains(kept)
     if not len(moving):
@@ -479,16 +479,16 @@ def _flight_error(setup: Setup, frame: int, kept: PathSet) -> float:
 
 
 def _with_chains(kept: PathSet) -> PathSet:
-    """The paths whose delays `delays` finds elsewhere too. Clutter by way of a mirror flies like a
-    farther scatterer: one bounce is the worse case."""
+    """Select the paths whose delays `delays` can evaluate. Two-bounce clutter moves like a farther
+    scatterer and is left out: one bounce is the worse case."""
     there = (kept.kind != PathKind.DIFFUSE) | ((kept.faces >= 0).any(axis=1) & (kept.bounces == 1))
     return kept.select(~kept.bent & (kept.kind != PathKind.LEAKAGE) & there)
 
 
 def _turning_error(setup: Setup, frame: int, kept: PathSet) -> float:
-    """Largest phase by which elements see a kept path change otherwise than the centroids within
-    the frame [rad]: every transmit element with the first and the last receive element, where the
-    UAVs are at the ends of the frame and as they are turned there."""
+    """Return the largest phase error of constant directions within the frame [rad]: change of the
+    element delays against those of the centroids at the ends of the frame, for all transmit
+    elements with the first and last receive element."""
     reach, epoch = frame_reach(setup.waveform), setup.timetable.epoch(frame)
     moving = _with_chains(kept)
     if not len(moving):
@@ -511,8 +511,8 @@ def delays(
     city: CityMesh,
     elements: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:
-    """(K,) delays of the same chains and scatterers with the UAVs elsewhere [s], between two of
-    their `elements` (3,), (3,) about the centroids."""
+    """Return the delays (K,) [s] of the same interaction sequences and scatterers for other poses,
+    between two `elements` (3,), (3,) about the centroids."""
     local = {
         name: replace(pose, position=pose.position - city.origin) for name, pose in poses.items()
     }
@@ -523,20 +523,20 @@ def delays(
     out = np.zeros(len(paths))
     scattered = paths.kind == PathKind.DIFFUSE
     points = paths.points[scattered, 0] - city.origin if scattered.any() else np.zeros((0, 3))
-    out[scattered] = sum(np.linalg.norm(points - body.position, axis=1) for body in (start, end))
+    out[scattered] = sum(np.linalg.norm(points - pose.position, axis=1) for pose in (start, end))
     plain = np.isin(paths.kind, (PathKind.LINE_OF_SIGHT, PathKind.SPECULAR))
     out[plain] = _lengths(paths.faces[plain], start, end, city)
     middle = (paths.faces.shape[1] - 1) // 2
     for number in np.unique(paths.target[paths.target >= 0]):
         here = (paths.target == number) & np.isin(paths.kind, (PathKind.TARGET, PathKind.GHOST))
-        body = local[paths.target_names[number]]
+        pose = local[paths.target_names[number]]
         there, back = paths.faces[here, :middle], paths.faces[here, middle + 1 :][:, ::-1]
-        out[here] = _lengths(there, start, body, city) + _lengths(back, end, body, city)
+        out[here] = _lengths(there, start, pose, city) + _lengths(back, end, pose, city)
     return out / SPEED_OF_LIGHT
 
 
 def _lengths(faces: np.ndarray, start: Pose, end: Pose, city: CityMesh) -> np.ndarray:
-    """(K,) lengths of unfolded chains (K, B), -1 where a chain is shorter [m]."""
+    """Return the lengths (K,) [m] of unfolded interaction sequences (K, B), padded with -1."""
     out = np.zeros(len(faces))
     normals, offsets = (
         plane_of_each_face(city) if city.num_faces else (np.zeros((0, 3)), np.zeros(0))
@@ -550,8 +550,8 @@ def _lengths(faces: np.ndarray, start: Pose, end: Pose, city: CityMesh) -> np.nd
 
 
 def _synthesis_error(setup: Setup, frame: Frame, link: Link, level: float) -> float:
-    """Relative RMS error of the synthesis that the run uses, on some of a frame's paths, none of
-    them taken for covered by noise."""
+    """Return the relative RMS error of the run's synthesis on some of a frame's paths, below-noise
+    paths excluded."""
     kept = frame.paths[link]
     if not len(kept):
         return 0.0
@@ -564,10 +564,10 @@ def _synthesis_error(setup: Setup, frame: Frame, link: Link, level: float) -> fl
 
 
 def _below_noise_error(setup: Setup, frame: Frame, link: Link, level: float) -> float:
-    """Most that the synthesis of paths that noise covers errs in a range-Doppler cell, over its
-    noise, if all channels' errors were in phase."""
+    """Return the largest error power of below-noise paths in a range-Doppler cell, over its noise,
+    with the errors of all channels in phase."""
     kept = frame.paths[link]
-    if not len(kept) or not setup.plan.covered:
+    if not len(kept) or not setup.plan.below_noise:
         return 0.0
     method = setup.plan.synthesis(len(kept), level)
     cube = _made(setup, frame, link, kept, method)
@@ -580,12 +580,12 @@ def _below_noise_error(setup: Setup, frame: Frame, link: Link, level: float) -> 
 
 
 def _uncovered(method: Method) -> Method:
-    """The same method with no path taken for covered by noise."""
-    return replace(method, covered=0.0) if isinstance(method, Auto) else method
+    """Return the method without below-noise paths."""
+    return replace(method, below_noise=0.0) if isinstance(method, Auto) else method
 
 
 def _made(setup: Setup, frame: Frame, link: Link, paths: PathSet, method: Method) -> IFCube:
-    """Some of a link's paths as samples without noise."""
+    """Synthesise some of a link's paths without noise."""
     links = [(frame.sent[link.tx], paths)]
     receiver = ReceiveArray(frame.poses[link.rx], setup.antennas)
     reference = Reference(setup.timetable.start_time(frame.number, link.tx))

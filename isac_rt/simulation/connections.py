@@ -12,11 +12,11 @@ from isac_rt.frame.link import Link
 
 @dataclass(frozen=True)
 class Connections:
-    """Who can receive whom, in which blocks, and by how much clocks are apart.
+    """Links, their resource blocks, and clock differences.
 
     Attributes
     ----------
-    clocks : of every terminal against true time; empty where an external source keeps them equal
+    clocks : of each terminal against true time; empty with external synchronisation
     establishment : outcome of the stages before the data
         (`isac_rt.extensions.access.protocol.Establishment`); None when they were left out, and
         everything is as stated
@@ -31,9 +31,9 @@ class Connections:
         links = {} if self.establishment is None else self.establishment.links
         return frozenset(link for link, state in links.items() if not state.acknowledged)
 
-    def apart(self, sender: str, link: Link, time: float) -> Clock:
-        """Clock of a sender against that of a link's receiver, corrected by what the receiver
-        learnt of the link's transmitter.
+    def clock_difference(self, sender: str, link: Link, time: float) -> Clock:
+        """Return the clock of a sender against that of a link's receiver, corrected by the
+        receiver's estimate of the transmitter's clock.
 
         Returns
         -------
@@ -53,19 +53,19 @@ class Connections:
         return Clock(offset, drift)
 
     def offset_std(self, link: Link, time: float) -> float:
-        """Standard deviation of what is left of a link's clocks at `time` [s]."""
+        """Return the standard deviation of a link's residual clock offset at `time` [s]."""
         state = None if self.establishment is None else self.establishment.links[link].clock
         return 0.0 if state is None else state.offset_std_at(time)
 
     def summary(self, time: float) -> dict[str, Any] | None:
-        """For `summary.json`: what was decided, what was decided wrongly, clock errors left at
-        `time`; None without the stages."""
+        """Return the entry of `summary.json`: decisions, wrong decisions, and residual clock errors
+        at `time`; None without access stages."""
         e = self.establishment
         if e is None:
             return None
         links = {}
         for link, state in e.links.items():
-            left = self.apart(link.tx, link, time)
+            left = self.clock_difference(link.tx, link, time)
             known = state.clock is not None
             links[str(link)] = {
                 "identified": state.identified,

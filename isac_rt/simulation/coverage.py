@@ -160,7 +160,7 @@ def _link_coverage(
     w, passes = timetable.waveform, link.passes
     cell, velocity, across, up = resolutions(w, antennas, passes).tolist()
     sideways, upwards = antennas.observes(passes)
-    apart = antennas.turns(SPEED_OF_LIGHT / float(w.carrier()), passes)[0]
+    unambiguous_span = antennas.turns(SPEED_OF_LIGHT / float(w.carrier()), passes)[0]
     return LinkCoverage(
         link=str(link),
         max_range_m=w.num_range_cells * cell,
@@ -172,7 +172,7 @@ def _link_coverage(
         azimuth_resolution_deg=_degrees(across) if sideways else None,
         elevation_resolution_deg=_degrees(up) if upwards else None,
         field_of_view_deg=float(np.degrees(antennas.half_view)),
-        unambiguous_angle_deg=_degrees(apart / 2),
+        unambiguous_angle_deg=_degrees(unambiguous_span / 2),
         bit_rate_bps=None if link.own else _bit_rate(link, timetable),
     )
 
@@ -222,12 +222,12 @@ def _leg(start: _Flight, end: _Flight, antennas: Antennas) -> tuple[np.ndarray, 
 def _outside(
     link: Link, name: str, flights: dict[str, _Flight], antennas: Antennas, of: LinkCoverage
 ) -> Outside:
-    tx, rx, body = (flights[n] for n in (link.tx, link.rx, name))
-    length, rate, in_view = _leg(rx, body, antennas)
+    tx, rx, uav = (flights[n] for n in (link.tx, link.rx, name))
+    length, rate, in_view = _leg(rx, uav, antennas)
     if name == link.tx:  # the line of sight
         in_view &= _leg(tx, rx, antennas)[2]
     elif not link.own:
-        first, first_rate, lit = _leg(tx, body, antennas)
+        first, first_rate, lit = _leg(tx, uav, antennas)
         length, rate, in_view = length + first, rate + first_rate, in_view & lit
     half = of.range_resolution_m / 2  # a path is looked for in the row that is nearest
     far, near = length >= of.max_range_m - half, length < of.min_range_m - half

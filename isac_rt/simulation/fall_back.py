@@ -1,12 +1,10 @@
 """The paper's fall-back from a pseudo-random antenna schedule to a conventional one, frame by
-frame, on the receivers' advice.
+frame, by feedback of the receivers.
 
-A random schedule of fewer groups than transmit antennas rests on sparsity. Receivers of such frames
-say whether they found the scene sparse (`Reception.sparse`); the last word of each counts. A
-transmitter sends the conventional schedule as long as one of its receivers advises it, from the
-next frame on, and the random one otherwise. How the advice of a passive terminal reaches it is not
-modelled: it is one bit a frame.
-"""
+A random schedule with fewer groups than transmit antennas needs a sparse scene. Receivers test that
+in each frame (`Reception.sparse`). A transmitter sends the conventional schedule from the next
+frame on while the last test of one of its receivers failed. The feedback of a passive terminal is
+one bit per frame; its transmission is not modelled."""
 
 from __future__ import annotations
 
@@ -24,11 +22,10 @@ class Schedules:
 
     Attributes
     ----------
-    usual : the scenario's
+    usual : schedule of the scenario
     num_tx : transmit antennas
-    fall_back : whether advice is taken; without, the usual one is always sent
-    advice : whether each receiver last found the scene sparse
-    """
+    fall_back : use the feedback; else always send the usual schedule
+    advice : result of the last test of each receiver, True: sparse"""
 
     usual: Schedule
     num_tx: int
@@ -36,14 +33,13 @@ class Schedules:
     advice: dict[Link, bool] = field(default_factory=dict)
 
     def of(self, active: str) -> Schedule:
-        """The schedule of an active terminal's next frame."""
+        """Return the schedule of an active terminal's next frame."""
         dense = any(tx == active and not sparse for (tx, _), sparse in self.advice.items())
         groups, chirps = self.usual.shape
         return conventional_schedule(groups, chirps, self.num_tx) if dense else self.usual
 
     def take_advice(self, receptions: Mapping[Link, Reception]) -> None:
-        """Note what the receivers of a frame advise. One that could not tell keeps its last
-        advice."""
+        """Store the test results of a frame; a receiver without one keeps its last result."""
         if self.fall_back:
             self.advice |= {
                 link: r.sparse for link, r in receptions.items() if r.sparse is not None

@@ -1,7 +1,6 @@
-r"""The error budget: what a scene needs, link by link and frame by frame, with the bound of what is
-left out.
+r"""The error budget: effects that each link and frame needs, with bounds of those omitted.
 
-Phases. Two approximations turn the phase of a path that is kept; each may use half of
+Phases. Two approximations change the phase of a path; each may use half of
 ``accuracy.max_phase_error_rad``:
 
 - plane for spherical wavefronts: an element at r from its array's centroid errs by :math:`k
@@ -10,22 +9,21 @@ Phases. Two approximations turn the phase of a path that is kept; each may use h
 - straight for accelerated flight within a frame: :math:`\pi f_c |\ddot\tau| t^2`, t to the farthest
   chirp of the frame.
 
-Left out. Paths the IF filter stops in every group, chirp and symbol are left out at no error.
-Ghosts and paths of the city so weak that all that are left out of one range cell together stay
-``propagation.weakest_path_db`` below the noise of a range-Doppler-antenna cell: powers add,
-whatever the phases, on average. Chains of walls that no ray met are missed
-(`isac_rt.propagation.legs.chains`); those that are met are placed without error. The share of
-paths that is missed is taken for the share that only one half of the time samples finds, the even
-or the odd ones: the second half of the rays adds half of that number, and what all further rays
-would add is taken for twice as much as that. Chances of being met are spread over decades, so that
-rules for equal chances (capture and recapture) state a tenth of the truth and less. All paths over
-`COUNTS_DB` show the share: those over `MATTERS_DB`, which count, are too few to.
+Omitted paths. Paths that the IF filter stops in all groups, chirps and symbols are omitted without
+error. Of ghosts and paths of the city the weakest are omitted as long as their power per range cell
+stays ``propagation.weakest_path_db`` below the noise of a range-Doppler-antenna cell; powers add on
+average, whatever the phases. Interaction sequences that no ray hits are missed
+(`isac_rt.propagation.legs.chains`); the others have no error.
 
-What is not modelled whatever the budget: directions that turn within a frame (`turning_bound`, no
-part of ``accuracy.max_phase_error_rad``), jerk, motion during the flight of light, chirps that
-reach the next slot (`next_slot_delay`). But in `Exact` paths are born and die in whole chirps: half
-a chirp of the frame's P at either end, 1/(2 P) of the path's amplitude.
-"""
+The share of missed paths is estimated by the share that only the even or only the odd time samples
+find. The second half of the rays adds half of that number; all further rays are assumed to add
+twice as much. Capture-recapture underestimates tenfold here: hit probabilities span decades. The
+share is that of all paths over `COUNTS_DB`, because those over `MATTERS_DB` are too few.
+
+Never modelled: change of directions within a frame (`turning_bound`, not part of
+``accuracy.max_phase_error_rad``), jerk, motion during the flight of light, and chirps that reach
+the next slot (`next_slot_delay`). Except in `Exact`, paths begin and end at whole chirps: an error
+of half a chirp of P at either end, 1/(2 P) of the path's amplitude."""
 
 from __future__ import annotations
 
@@ -52,29 +50,28 @@ from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Swarm
 
 MATTERS_DB = -10.0
-"""Paths over this count as missed [dB over the noise of a cell]."""
+"""Least power of a path that counts as missed [dB over the noise of a cell]."""
 COUNTS_DB = -40.0
-"""Paths over this show what share is missed [dB over the noise of a cell]."""
+"""Least power of the paths that estimate the missed share [dB over the noise of a cell]."""
 MOST_DIRECT = 2000
-"""Paths up to which the preset everything takes the direct synthesis, whose time grows with them;
-beyond, `Auto`."""
+"""Most paths for direct synthesis by the preset everything; `Auto` for more."""
 
-COVERED_DB = 20.0
-"""How far under the noise of a cell of all channels the error stays of paths that noise covers: a
-hundredth of the noise's power."""
+BELOW_NOISE_DB = 20.0
+"""Level of the error of below-noise paths under the noise of a cell of all channels [dB]: a
+hundredth of its power."""
 MOST_SPREAD = 12
-"""Instants of a run at which its clutter is held against its noise."""
+"""Most instants of a run at which clutter is compared with noise."""
 REACH_MARGIN_M = 1.0
-"""What the mesh reaches farther, for accelerations within a frame."""
+"""Margin of the mesh radius for accelerations within a frame [m]."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The decisions of a run that are taken before it.
+    """Decisions before a run.
 
     Attributes
     ----------
-    accuracy, propagation : what the scenario asks for
+    accuracy, propagation : settings of the scenario
     antennas, timetable, swarm : of the run
     amplitude : sqrt(transmit power) of an antenna [sqrt(W)]
     """
@@ -96,38 +93,36 @@ class Plan:
 
     @property
     def phase_share(self) -> float:
-        """Most that either approximation may turn a phase [rad]."""
+        """Bound of the phase error of either approximation [rad]."""
         return 0.0 if self.preset == "everything" else self.accuracy.max_phase_error_rad / 2
 
     @property
     def weakest(self) -> float:
-        """Power that may be left out of a range cell over the noise of a cell (linear)."""
+        """Largest omitted power of a range cell over the noise of a cell (linear)."""
         if self.preset == "everything":
             return 0.0
         return float(10 ** (-self.propagation.weakest_path_db / 10))
 
     @property
     def max_untraced(self) -> float:
-        """Most flight of a terminal between two time samples, places from which rays search for
-        walls; 0: they search from each frame's own [m]."""
+        """Largest flight between two time samples, from which rays search for walls [m]; 0: search
+        from each frame."""
         return 0.0 if self.preset == "everything" else self.accuracy.max_untraced_m
 
     def synthesis(self, num_paths: int, noise_power: float = 0.0) -> Method:
-        """Method of `isac_rt.signal.if_signal.if_signal` for a cube of so many paths, over noise of
-        this power [W]."""
+        """Return the method of synthesis for a number of paths and a noise power [W]."""
         if self.preset == "everything" and num_paths <= MOST_DIRECT:
             return Direct()
-        return Auto(noise_power=noise_power, covered=self.covered)
+        return Auto(noise_power=noise_power, below_noise=self.below_noise)
 
     @property
-    def covered(self) -> float:
-        """Error of the synthesis that noise covers, over the noise of a cell of all channels; 0:
-        none."""
-        return 0.0 if self.preset != "budget" else float(10 ** (-COVERED_DB / 10))
+    def below_noise(self) -> float:
+        """Error of below-noise paths over the noise of a cell of all channels; 0: no path is below
+        noise."""
+        return 0.0 if self.preset != "budget" else float(10 ** (-BELOW_NOISE_DB / 10))
 
     def spread_frames(self) -> list[int]:
-        """Frames that show how the run changes: as few as are a metre of flight apart, evenly, and
-        `MOST_SPREAD` at most."""
+        """Return evenly spaced frames, a metre of flight apart, `MOST_SPREAD` at most."""
         frames = self.timetable.frames
         poses = [self.swarm.poses(self.timetable.epoch(frame)) for frame in range(frames)]
         flown_distance = max(
@@ -142,37 +137,35 @@ class Plan:
 
     @cached_property
     def longest_delay(self) -> float:
-        """A path with more delay than this reaches no receiver: the IF filter stops it in every
-        group [s]."""
+        """Largest delay of a received path [s]; beyond, the IF filter stops it in all groups."""
         w = self.waveform
         blocks = [b for b in self.timetable.blocks.values() if b is not None] or [0]
-        apart = max(blocks) - min(blocks) + w.num_groups - 1
+        groups_between = max(blocks) - min(blocks) + w.num_groups - 1
         last = self.timetable.epoch(self.timetable.frames)
         clocks = 2 * max(
             abs(u.clock_offset_s) + 1e-6 * abs(u.clock_drift_ppm) * last
             for u in self.swarm.uavs.values()
         )
         skirt = w.filter_transition / w.slope
-        return w.max_delay + skirt + apart * w.group_spacing + clocks
+        return w.max_delay + skirt + groups_between * w.group_spacing + clocks
 
     @property
     def reach(self) -> float:
-        """Farthest from its terminal that a surface can be received [m]."""
+        """Largest distance of a received surface from its terminal [m]."""
         return self.longest_delay * SPEED_OF_LIGHT / 2
 
     @property
     def whole_mesh(self) -> bool:
-        """Return whether the mesh is left whole, not cut to `mesh_radius`."""
+        """True if the mesh is not cut to `mesh_radius`."""
         return self.preset == "everything" or self.propagation.model != "ray_traced"
 
     def mesh_radius(self, centre: np.ndarray) -> float:
-        """A surface farther than this from a place takes part in nothing that is received, whole
-        metres [m].
+        """Return the distance from a position beyond which no surface contributes, in whole metres
+        [m].
 
-        All points of a path of length L, what shadows it included, lie within L/2 of the middle
-        between its ends, which is no farther from the place than the farther end. What moves during
-        a frame adds its way. The field of view cuts nothing: a second wall may stand outside it.
-        """
+        All points of a path of length L, and what blocks it, lie within L/2 of the middle between
+        its ends, which is no farther from the position than the farther end. Motion during a frame
+        is added. The field of view is not used: a second wall may lie outside it."""
         terminals = [name for name, uav in self.swarm.uavs.items() if uav.role != "target"]
         times = map(self.timetable.epoch, range(self.timetable.frames))
         poses = [self.swarm.poses(time) for time in times]
@@ -182,7 +175,7 @@ class Plan:
             for name in terminals
         )
         fastest = max(
-            float(np.linalg.norm(body.velocity)) for pose in poses for body in pose.values()
+            float(np.linalg.norm(pose.velocity)) for state in poses for pose in state.values()
         )
         flown_distance = 2 * fastest * frame_reach(self.waveform)
         return float(np.ceil(farthest + self.reach + flown_distance + REACH_MARGIN_M))
@@ -193,8 +186,8 @@ class Plan:
         return self.amplitude**2 * self.waveform.num_samples * self.waveform.num_chirps
 
     def chosen(self, paths: PathSet, noise_power: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """Mark the paths that are received and those that are too weak, (K,) bool each; return also
-        the most that a range cell loses over the noise."""
+        """Mark received paths and those too weak, (K,) bool each; also return the largest omitted
+        power of a range cell over the noise."""
         over_noise = paths.power * self.cell_noise_gain() / noise_power
         everything = self.preset == "everything"
         received = (
@@ -210,7 +203,7 @@ class Plan:
         return received, weak, left_out
 
     def apply(self, paths: PathSet, noise_power: float) -> tuple[PathSet, Use]:
-        """Select what a link's frame needs of its paths.
+        """Select the paths of a link's frame and their approximations.
 
         Parameters
         ----------
@@ -245,29 +238,28 @@ class Plan:
 
 
 def frame_reach(waveform: Waveform) -> float:
-    """From the middle of a frame to its farthest sample [s]."""
+    """Return the time from mid-frame to the farthest sample [s]."""
     return waveform.frame_duration / 2 + (waveform.num_groups - 1) * waveform.group_spacing
 
 
 def motion(paths: PathSet, waveform: Waveform) -> np.ndarray:
-    """(K,) most by which motion changes a delay within the frame [s]."""
+    """Return the largest change of each delay by motion within the frame (K,) [s]."""
     t = frame_reach(waveform)
     return np.abs(paths.delay_rate) * t + np.abs(paths.delay_accel) * t**2 / 2
 
 
 def faintest(power: np.ndarray, cell: np.ndarray, limit: float) -> tuple[np.ndarray, float]:
-    """The faintest of each cell whose powers together stay within a limit.
+    """Mark the weakest paths of each cell whose sum of powers stays within a limit.
 
     Parameters
     ----------
-    power : (K,); inf for what must stay
+    power : (K,); inf for a path that must stay
     cell : (K,) int
 
     Returns
     -------
     mask : (K,) bool
-    most : largest sum that a cell lost
-    """
+    most : largest omitted sum of a cell"""
     some = np.flatnonzero(power <= limit)
     order = some[np.lexsort([power[some], cell[some]])]
     sums, cells = np.cumsum(power[order]), cell[order]
@@ -281,7 +273,8 @@ def faintest(power: np.ndarray, cell: np.ndarray, limit: float) -> tuple[np.ndar
 
 
 def plane_bound(paths: PathSet, antennas: Antennas, waveform: Waveform) -> np.ndarray:
-    """(K,) bound of the phase error of a plane wavefront at the farthest elements [rad]."""
+    """Return the bound (K,) of the phase error of a plane wavefront at the farthest elements
+    [rad]."""
     reach = [
         np.linalg.norm(positions, axis=1).max()
         for positions in (antennas.tx_positions, antennas.rx_positions)
@@ -296,7 +289,7 @@ def plane_bound(paths: PathSet, antennas: Antennas, waveform: Waveform) -> np.nd
 
 
 def straight_bound(paths: PathSet, waveform: Waveform) -> np.ndarray:
-    """(K,) bound of the phase error of leaving the acceleration out, at the ends of the frame
+    """Return the bound (K,) of the phase error without acceleration, at the ends of the frame
     [rad]."""
     return np.pi * _highest(waveform) * np.abs(paths.delay_accel) * frame_reach(waveform) ** 2
 
@@ -304,13 +297,12 @@ def straight_bound(paths: PathSet, waveform: Waveform) -> np.ndarray:
 def turning_bound(
     paths: PathSet, antennas: Antennas, waveform: Waveform, swarm: Swarm
 ) -> np.ndarray:
-    r"""(K,) bound of the phase error of directions that stay as they are at mid-frame, at the
-    farthest elements and the ends of the frame [rad].
+    r"""Return the bound (K,) of the phase error of constant directions, at the farthest elements
+    and the ends of the frame [rad].
 
-    Where a wavefront of radius R comes nearer or turns by the way v t of its source and of the
-    body, the delay of an element at r changes by :math:`r\,v t/(R - v t - r)` at most beside that
-    of the centroid. A UAV that turns itself moves its elements by so much.
-    """
+    For motion by v t of the source and of the UAV, the delay of an element at r changes by
+    :math:`r\,v t/(R - v t - r)` at most against that of the centroid, R the radius of the
+    wavefront. Rotation of the UAV moves its elements in addition."""
     t, k = frame_reach(waveform), 2 * np.pi * _highest(waveform) / SPEED_OF_LIGHT
     poses = swarm.poses(paths.epoch)
     flown_distance = {
@@ -338,37 +330,36 @@ def turning_bound(
 
 
 def flight_of_light(paths: PathSet, waveform: Waveform, speed: float) -> float:
-    """Phase by which UAVs move while light is on its way, estimated for the longest path [rad].
+    """Estimate the phase of motion during the flight of light for the longest path [rad].
 
     Parameters
     ----------
-    speed : of the fastest body [m/s]
-    """
+    speed : of the fastest UAV [m/s]"""
     k = 2 * np.pi * waveform.carrier_frequency / SPEED_OF_LIGHT
     return float((k * speed * paths.delay).max(initial=0.0))
 
 
 def next_slot_delay(waveform: Waveform, blocks: Iterable[int]) -> float:
-    """Delay [s] from which on a chirp of the last block in use, late by its data, passes the filter
-    of the first block's chirp of the next slot; methods of synthesis leave that out.
+    """Return the least delay [s] at which a chirp of the last block passes the filter of the first
+    block's chirp in the next slot, data delay included; synthesis omits such chirps.
 
     Parameters
     ----------
     blocks : first resource block of each transmitter
     """
     w, first = waveform, list(blocks)
-    apart = max(first) + w.num_groups - 1 - min(first)
+    groups_between = max(first) + w.num_groups - 1 - min(first)
     data = w.num_delay_symbols * w.delay_step if w.carries_data else 0.0
-    return w.slot_duration - apart * w.group_spacing - data - w.filter_transition / w.slope
+    return w.slot_duration - groups_between * w.group_spacing - data - w.filter_transition / w.slope
 
 
 def _highest(waveform: Waveform) -> float:
-    """Highest frequency of the chirp [Hz]."""
+    """Return the highest frequency of the chirp [Hz]."""
     return waveform.carrier_frequency + waveform.bandwidth
 
 
 def decisions(plan: Plan) -> dict[str, Any]:
-    """Return what is fixed before a run: the same in `isac-rt plan` and in summary.json."""
+    """Return the decisions before a run, as in `isac-rt plan` and summary.json."""
     everything = plan.preset == "everything"
     return {
         "preset": plan.preset,
@@ -378,12 +369,12 @@ def decisions(plan: Plan) -> dict[str, Any]:
         "reach_m": None if everything else round(plan.reach, 3),
         "synthesis": plan.synthesis(0).name,
         "synthesis_error": GRIDDED_ERROR,
-        "covered_error_db": COVERED_DB if plan.covered else None,
+        "below_noise_error_db": BELOW_NOISE_DB if plan.below_noise else None,
     }
 
 
 def mechanisms(p: Propagation, c: Clutter) -> dict[str, Any]:
-    """List the modelled mechanisms of propagation and clutter, as the scenario says."""
+    """List the modelled mechanisms of propagation and clutter."""
     traced = p.model == "ray_traced"
     return {
         "propagation": p.model,
@@ -397,7 +388,7 @@ def mechanisms(p: Propagation, c: Clutter) -> dict[str, Any]:
 
 
 def extent(city: CityMesh, census: Census, clutter: Clutter) -> dict[str, Any]:
-    """Return how much of the city and of its clutter takes part: the same in `isac-rt plan` and in
+    """Return the parts of the city and of its clutter in the run, as in `isac-rt plan` and
     summary.json.
 
     Returns

@@ -1,5 +1,4 @@
-"""Checks before a run begins: whether it fits into memory, whether its UAVs keep apart and out of
-the city, and whether they can be seen."""
+"""Checks before a run: memory, collisions between UAVs and with the city, and coverage."""
 
 from __future__ import annotations
 
@@ -21,9 +20,9 @@ from isac_rt.propagation.settings import Clutter
 from isac_rt.runtime import available_memory
 from isac_rt.scenario.tree import NEAREST_M
 from isac_rt.simulation.coverage import Coverage, Outside, unambiguous_velocity
+from isac_rt.world.city.georeference import local_origin
 from isac_rt.world.city.mesh import CityMesh, empty_city
 from isac_rt.world.city.meshfiles import point_in_file
-from isac_rt.world.city.place import local_origin
 from isac_rt.world.passage import TOUCH_M, enclosed, first_passage, obstacles
 from isac_rt.world.settings import City
 from isac_rt.world.swarm import Pose, Swarm
@@ -41,11 +40,10 @@ ALIAS_EPOCHS = 50
 def memory_needed(
     waveform: Waveform, antennas: Antennas, frames: int, links: int, at_once: int
 ) -> float:
-    """Estimate of a run's memory [bytes], the city's mesh and its clutter left out.
+    """Estimate a run's memory [bytes], without the city's mesh and its clutter.
 
-    Each receiver at work holds its cube, a copy that it turns, the range spectra and the Doppler
-    maps; each frame of a link leaves its record behind.
-    """
+    Each active receiver holds its cube, a derotated copy, range spectra and Doppler maps; each
+    frame of a link adds a record."""
     w = waveform
     chirps = w.num_groups * w.num_chirps
     cube = chirps * antennas.num_rx * w.num_samples
@@ -55,12 +53,13 @@ def memory_needed(
 
 
 def receivers_at_work() -> int:
-    """One more than the machine has cores, since now and then one waits for the interpreter."""
+    """Return the number of receiver threads: one more than cores, as one may wait for the
+    interpreter."""
     return (os.cpu_count() or 1) + 1
 
 
 def check_memory(antennas: Antennas, timetable: Timetable) -> None:
-    """Refuse a run that does not fit.
+    """Refuse a run that exceeds the free memory.
 
     Raises
     ------
@@ -78,9 +77,8 @@ def check_memory(antennas: Antennas, timetable: Timetable) -> None:
 
 
 def check_flights(swarm: Swarm, timetable: Timetable) -> None:
-    """Refuse flights on which two UAVs meet, or on which the numbers run out of float64's range:
-    at such a frame there are no directions between them. In very long runs only every so manyth
-    frame is looked at.
+    """Refuse flights on which two UAVs meet or coordinates overflow float64. Long runs are checked
+    every n-th frame.
 
     Raises
     ------
@@ -90,29 +88,29 @@ def check_flights(swarm: Swarm, timetable: Timetable) -> None:
     step = max(1, timetable.frames // MOST_EPOCHS)
     epochs = np.array([timetable.epoch(frame) for frame in range(0, timetable.frames, step)])
     with np.errstate(over="ignore", invalid="ignore"):
-        places = {
+        polylines = {
             name: np.array([flight.pose(t).position for t in epochs])
             for name, flight in swarm.trajectories.items()
         }
-    for name, polyline in places.items():
+    for name, polyline in polylines.items():
         if not np.isfinite(polyline).all() or np.abs(polyline).max() > 1e12:
             raise ScenarioError(
                 f"swarm.{name}: flies beyond all bounds; lower its velocity, or the time between "
                 "its waypoints"
             )
-    for (a, first), (b, second) in itertools.combinations(places.items(), 2):
-        apart = np.linalg.norm(first - second, axis=1)
-        nearest = int(np.argmin(apart))
-        if apart[nearest] < NEAREST_M:
+    for (a, first), (b, second) in itertools.combinations(polylines.items(), 2):
+        distance = np.linalg.norm(first - second, axis=1)
+        nearest = int(np.argmin(distance))
+        if distance[nearest] < NEAREST_M:
             raise ScenarioError(
-                f"swarm.{b}: is {apart[nearest]:.2g} m from {a} at {epochs[nearest]:.4g} s (frame "
-                f"{nearest * step}), at least "
+                f"swarm.{b}: is {distance[nearest]:.2g} m from {a} at {epochs[nearest]:.4g} s "
+                f"(frame {nearest * step}), at least "
                 f"{NEAREST_M} m are needed; change one of their flights"
             )
 
 
 def _check_times(swarm: Swarm, timetable: Timetable) -> None:
-    """Refuse waypoints of another time than the run's, and warn of those of a part of it."""
+    """Refuse waypoints outside the time of the run, and warn of those that cover a part of it."""
     begin, end = timetable.epoch(0), timetable.epoch(timetable.frames - 1)
     for name, uav in swarm.uavs.items():
         if uav.waypoints is None:
@@ -133,7 +131,7 @@ def check_passage(swarm: Swarm, timetable: Timetable, city: CityMesh) -> None:
 
     Parameters
     ----------
-    city : the whole of it; what a plan cuts away may be the ground under a target
+    city : the whole city; the part beyond the reach may be the ground under a target
 
     Raises
     ------
@@ -143,21 +141,21 @@ def check_passage(swarm: Swarm, timetable: Timetable, city: CityMesh) -> None:
     starts = np.array([flight.pose(begin).position for flight in swarm.trajectories.values()])
     inside = [enclosed(city, start) for start in starts - city.origin]
     solid = obstacles(city, starts - city.origin) if any(inside) else empty_city("", city.origin)
-    turn = ", or turn the faces of a room inward" if all(inside) else ""
+    remedy = ", or turn the faces of a room inward" if all(inside) else ""
     for name, flight in swarm.trajectories.items():
-        times, places = flight.polyline(begin, end)
-        polyline = places - city.origin
+        times, points = flight.polyline(begin, end)
+        polyline = points - city.origin
         keys = "waypoints" if swarm.uavs[name].waypoints else "position_m or velocity_mps"
         if enclosed(solid, polyline[0]):
             raise ScenarioError(
                 f"swarm.{name}: starts inside a building of {city.name} or under its ground, at "
-                f"{_said(places[0])} m; change its {keys}{turn}"
+                f"{_said(points[0])} m; change its {keys}{remedy}"
             )
         found = first_passage(city, _off_the_ends(polyline))
         if found is not None:
             a, b = found.segment, found.segment + 1
             when = times[a] + found.share * (times[b] - times[a])
-            where = places[a] + found.share * (places[b] - places[a])
+            where = points[a] + found.share * (points[b] - points[a])
             made_of = city.materials[city.face_material[found.face]].name
             raise ScenarioError(
                 f"swarm.{name}: flies through a surface of {city.name} ({made_of}) at {when:.3g} s "
@@ -166,12 +164,12 @@ def check_passage(swarm: Swarm, timetable: Timetable, city: CityMesh) -> None:
 
 
 def check_reach(settings: City | None, city: CityMesh, reach: float) -> None:
-    """Refuse a city that lies elsewhere, and warn of its doubts.
+    """Refuse a city out of reach, and warn of doubts about it.
 
     Parameters
     ----------
-    city : the whole of it, about the middle of the flights
-    reach : distance from there beyond which a surface takes part in nothing [m]
+    city : the whole city, about the middle of the flights
+    reach : distance from there beyond which no surface contributes [m]
 
     Raises
     ------
@@ -191,14 +189,14 @@ def check_reach(settings: City | None, city: CityMesh, reach: float) -> None:
     point, where = np.append((low + high)[:2] / 2, low[2]), ""
     if settings.source == "mesh":
         where = _said(point_in_file(settings, Path(settings.file or ""), point))
-    elif city.place is not None:
-        where = str(list(local_origin(city.place, point)))
+    elif city.georeference is not None:
+        where = str(list(local_origin(city.georeference, point)))
     origin = "state the point of the file that becomes the world's origin, such as city.origin: "
     raise ScenarioError(f"{said}; {f'{origin}{where}, or ' if where else ''}move the swarm")
 
 
 def _off_the_ends(polyline: np.ndarray) -> np.ndarray:
-    """A way (T, 3) that begins and ends `TOUCH_M` later and earlier; what is shorter is a point."""
+    """Shorten a polyline (T, 3) by `TOUCH_M` at both ends, at most to a point."""
     out = polyline.copy()
     for end, inner in ((0, 1), (-1, -2)):
         step = polyline[inner] - polyline[end]
@@ -207,18 +205,17 @@ def _off_the_ends(polyline: np.ndarray) -> np.ndarray:
     return out
 
 
-def _said(place: np.ndarray) -> str:
-    return "[" + ", ".join(f"{value:.1f}" for value in place) + "]"
+def _said(position: np.ndarray) -> str:
+    return "[" + ", ".join(f"{value:.1f}" for value in position) + "]"
 
 
 def warn_of_aliases(
     swarm: Swarm, timetable: Timetable, antennas: Antennas, velocity_method: str, schedule: str
 ) -> None:
-    """Warn of what is in view and moves faster than the frame can tell: it is reported a whole
-    period slower, and what the groups' offsets make of it as weak further detections.
+    """Warn of UAVs in the field of view beyond the unambiguous velocity: their velocity aliases by
+    a period, and the time offsets of groups give weak further detections.
 
-    Looks at an active terminal's echoes and at lines of sight, in `ALIAS_EPOCHS` frames over the
-    run.
+    Checks echoes at active terminals and lines of sight, in `ALIAS_EPOCHS` frames of the run.
 
     Parameters
     ----------
@@ -238,15 +235,15 @@ def warn_of_aliases(
                 warnings.warn(
                     f"{what} moves at {rates[worst]:.4g} m/s (receding is positive) in frame "
                     f"{frames[worst]}, beyond the unambiguous {limit:.4g} m/s: it is reported at "
-                    f"about {shown:.3g} m/s, beside weaker false detections",
+                    f"about {shown:.3g} m/s, with weaker false detections",
                     ScenarioWarning,
                     stacklevel=3,
                 )
 
 
 def _closing(own: Pose, other: Pose, antennas: Antennas, passes: int) -> float:
-    """Range rate of another UAV [m/s], 0 where it is out of view (of either end, for a line of
-    sight)."""
+    """Return the range rate of another UAV [m/s]; 0 outside the field of view (of either end, for a
+    line of sight)."""
     line = other.position - own.position
     line = line / np.linalg.norm(line)
     seen = antennas.in_view(own.to_body(line)) and (
@@ -262,11 +259,11 @@ def warn_of_interference(
     city: CityMesh,
     budget: tuple[float, Callable[[dict[str, Pose], Link], float]],
 ) -> None:
-    """Warn of plain radars whose chirps arrive at each other over the noise of a sample: what is
-    simulated are radars on one clock, whose chirps take turns.
+    """Warn of plain radars that receive each other over the noise of a sample: the simulation
+    assumes one clock and separate slots.
 
-    Looks at the direct paths in `ALIAS_EPOCHS` frames over the run; power by Friis' equation with
-    the patterns of both antennas.
+    Checks direct paths in `ALIAS_EPOCHS` frames of the run; power by Friis' equation with the
+    patterns of both antennas.
 
     Parameters
     ----------
@@ -305,7 +302,7 @@ def warn_of_interference(
 
 
 def _direct_gain(tx: Pose, rx: Pose, antennas: Antennas, waveform: Waveform) -> float:
-    """Power that a receiver gets of a direct path over that of one transmit antenna: Friis'
+    """Return the received power of a direct path over the power of one transmit antenna: Friis'
     equation with the patterns of both elements, times the antennas that send at once."""
     polyline = rx.position - tx.position
     distance = float(np.linalg.norm(polyline))
@@ -316,15 +313,15 @@ def _direct_gain(tx: Pose, rx: Pose, antennas: Antennas, waveform: Waveform) -> 
 
 
 def warn_of_unseen(seen: Coverage) -> None:
-    """Warn of what cannot be seen: terminals whose data are lost, and UAVs that nobody sees."""
+    """Warn of terminals whose data are lost, and of UAVs outside all coverage."""
     limits, by_uav = {of.link: of for of in seen.links}, dict[str, list[Outside]]()
     for axis in ("azimuth", "elevation"):
         if blind := [
             link for link in limits if vars(limits[link])[f"{axis}_resolution_deg"] is None
         ]:
             _warn(
-                f"{' and '.join(blind)}: the array does not observe {axis}; tracks take bodies to "
-                "be in its plane; elements beside that plane (array.tx, array.rx) would tell"
+                f"{' and '.join(blind)}: the array does not observe {axis}; tracks assume UAVs in "
+                "its plane; add elements outside that plane (array.tx, array.rx)"
             )
     for row in seen.outside:
         tx, _, rx = row.link.partition("->")
@@ -338,8 +335,8 @@ def warn_of_unseen(seen: Coverage) -> None:
             )
         elif row.unseen == row.frames:
             _warn(
-                f"{rx} never sees {tx}, {_causes(row)}: it gets no data; turn the boresight of "
-                "one of them, or move it"
+                f"{tx} is outside the coverage of {rx}, {_causes(row)}: no data are received; "
+                "rotate the boresight of one of them, or move it"
             )
     unseen: dict[str, list[str]] = {}
     for name, rows in by_uav.items():
@@ -348,7 +345,9 @@ def warn_of_unseen(seen: Coverage) -> None:
             causes = "; ".join(f"{row.link.replace('->', ' to ')}: {_causes(row)}" for row in rows)
             unseen.setdefault(causes, []).append(name)
     for causes, names in unseen.items():
-        _warn(f"no terminal ever sees {', '.join(names)} ({causes}); move or turn it or them")
+        _warn(
+            f"{', '.join(names)}: outside the coverage of all terminals ({causes}); move or rotate"
+        )
 
 
 def _warn(said: str) -> None:
@@ -356,9 +355,9 @@ def _warn(said: str) -> None:
 
 
 def _causes(row: Outside) -> str:
-    """Why it is not seen, with the frames of each cause."""
+    """Return the causes with the frames of each."""
     counts = {
-        "out of view": row.out_of_view,
+        "outside the field of view": row.out_of_view,
         "beyond the range": row.beyond_range,
         "too near": row.too_near,
     }
@@ -366,7 +365,7 @@ def _causes(row: Outside) -> str:
 
 
 def check_reference(noise: Noise, clutter: Clutter, swarm: Swarm, timetable: Timetable) -> None:
-    """Refuse noise or clutter that refers to an echo that there is not.
+    """Refuse noise or clutter relative to an echo that does not exist.
 
     Raises
     ------

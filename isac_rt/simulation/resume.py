@@ -1,11 +1,9 @@
-"""The frames of a run that was stopped, in a file beside its results: the same run goes on after
-them, to the same bits.
+"""Saved frames of an interrupted run, in a file next to its results: the same run resumes after
+them, with identical results.
 
-The file is an SQLite database, so that an entry is in it whole or not at all, whenever the process
-is killed. It says which run it is of: a digest of the scenario, the city's file, the program and
-the versions under it. An entry is data only, with a checksum: one that is bent is as one that was
-never kept.
-"""
+The file is an SQLite database, so that a killed process leaves no partial entry. It holds a digest
+of scenario, city file, program and package versions. An entry is data with a checksum; a corrupted
+one is ignored."""
 
 from __future__ import annotations
 
@@ -31,22 +29,22 @@ if TYPE_CHECKING:
 
 FILE = "resume.sqlite"
 EARLIER = "unfinished.frames"
-"""What earlier versions wrote, which is not read."""
+"""Name of files of earlier versions, which are not read."""
 TABLES = {
     "run": "(digest TEXT PRIMARY KEY)",
     "entry": "(id INTEGER PRIMARY KEY, tree TEXT, arrays BLOB, checksum TEXT)",
 }
 EVERY = 5.0
-"""Least time between two entries: what a stop can cost, beside the frame at work. [s]"""
+"""Least time between two entries, which a stop loses at most besides the frame in progress [s]."""
 
 
 class ResumeError(UserError):
-    """The file is of another run, or holds what no run of this package wrote."""
+    """The file belongs to another run, or no run of this package wrote it."""
 
 
 @contextmanager
 def sole_use(folder: Path) -> Iterator[None]:
-    """Hold a folder of results for one run.
+    """Lock a folder of results for one run.
 
     Raises
     ------
@@ -66,7 +64,7 @@ def sole_use(folder: Path) -> Iterator[None]:
 
 
 def check_replaces_nothing(folder: Path, scenario: Scenario) -> None:
-    """Refuse a folder that holds the whole results of another scenario.
+    """Refuse a folder with complete results of another scenario.
 
     Raises
     ------
@@ -88,9 +86,9 @@ def check_replaces_nothing(folder: Path, scenario: Scenario) -> None:
         )
 
 
-def _in_use(place: Path) -> ResumeError:
+def _in_use(folder: Path) -> ResumeError:
     return ResumeError(
-        f"{place} is in use by another run; wait for its end or give another folder with --out"
+        f"{folder} is in use by another run; wait for its end or give another folder with --out"
     )
 
 
@@ -101,12 +99,12 @@ def _is_locked(problem: BaseException) -> bool:
 
 
 class Resume:
-    """The kept frames of one run.
+    """Saved frames of one run.
 
     Parameters
     ----------
     folder : of the results
-    content : all that the run's results depend on, as text
+    content : everything the run's results depend on, as text
     every : least time between two entries [s]
     """
 
@@ -117,11 +115,11 @@ class Resume:
 
     @property
     def begun(self) -> bool:
-        """Return whether frames of this very run are kept."""
+        """Test that frames of this run are saved."""
         return self._owner() == self._digest
 
     def check(self) -> None:
-        """Refuse a folder that keeps frames of another run, which are not this one's to take away.
+        """Refuse a folder with saved frames of another run.
 
         Raises
         ------
@@ -136,7 +134,7 @@ class Resume:
             )
 
     def entries(self) -> Iterator[Any]:
-        """Yield what an earlier call of this run kept, in its order.
+        """Yield the entries of earlier calls of this run, in order.
 
         Raises
         ------
@@ -154,7 +152,7 @@ class Resume:
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Turn what goes wrong with an entry into one message."""
+        """Convert errors of reading an entry into one message."""
         try:
             yield
         except (sqlite3.Error, *BAD_DATA) as problem:
@@ -162,19 +160,18 @@ class Resume:
                 raise _in_use(self.file) from None
             raise ResumeError(
                 f"{self.file} is damaged or was not written by isac-rt "
-                f"({type(problem).__name__}: {shortly(problem)}); --restart lets go of it"
+                f"({type(problem).__name__}: {shortly(problem)}); --restart discards it"
             ) from problem
 
     def due(self) -> bool:
-        """Return whether it is time for an entry."""
+        """Test that the next entry is due."""
         return time.monotonic() - self._last >= self._every
 
     def append(self, entry: Any) -> bool:
-        """Keep an entry, and return whether it could be kept.
+        """Save an entry; return False if that failed.
 
-        Where it could not (a full disk) what was kept before is still there, the run goes on, and
-        the next entry is due after twice the time.
-        """
+        After a failure, such as a full disk, earlier entries remain, the run continues, and the
+        next entry is due after twice the time."""
         tree, arrays = pack(entry)
         seal = checksum(self._digest, tree.encode() + arrays)
         try:
@@ -199,14 +196,14 @@ class Resume:
         return True
 
     def remove(self) -> None:
-        """Let go of what was kept."""
+        """Delete the saved frames."""
         for name in (FILE, f"{FILE}-journal", EARLIER):
             with suppress(OSError):
                 self.file.with_name(name).unlink(missing_ok=True)
 
     def _owner(self) -> str | None:
-        """Digest of the run whose frames are kept; "" if there are none, None if that cannot be
-        read."""
+        """Return the digest of the run whose frames are saved; "" without frames, None if
+        unreadable."""
         if not self.file.exists():
             return ""
         try:

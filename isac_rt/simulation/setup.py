@@ -1,4 +1,4 @@
-"""All that the frames of a run share, built once from the scenario."""
+"""Parts of a run that all frames share, built once from the scenario."""
 
 from __future__ import annotations
 
@@ -60,29 +60,28 @@ from isac_rt.world.city import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
 
 BY_BEAM = 10.0
-"""How much deeper than a single antenna a receiver is taken to see that adds its antennas in phase
-(of 45 channels 10 to 16 dB)."""
+"""Extra sensitivity assumed for beamforming receivers, linear (10 to 16 dB with 45 channels)."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame as it was sent and travelled: `Setup.frame` makes it.
+    """One frame with its transmissions and paths, built by `Setup.frame`.
 
     Attributes
     ----------
     number : from 0
     poses : of every UAV at the middle of the frame
-    paths : of every link from an active terminal to a receiver, interference between active
-        terminals included; what the plan leaves out is not there
+    paths : of each link from an active terminal to a receiver, with interference between active
+        terminals, without the paths that the plan omits
     sent : by every active terminal
-    expected : clutter that each active terminal expects of its own link, from the mesh, in frames
-        that it processes; empty where no receiver asks for it
-    uses : what the plan kept of the paths of each link
-    dropped : traced paths that the float64 geometry contradicted
+    expected : clutter of its monostatic link that each active terminal expects from the mesh, in
+        frames that it processes; empty if no receiver uses it
+    uses : selection of paths of each link by the plan
+    dropped : traced paths rejected by the float64 geometry
 
     Examples
     --------
-    The samples that PT1 receives of the AT, and what its receiver makes of them:
+    The samples that PT1 receives from the AT:
 
     >>> import isac_rt as irt
     >>> scenario = irt.load("scenes/paper_swarm_consistent.yaml")
@@ -104,7 +103,7 @@ class Frame:
     _setup: Setup = field(repr=False)
 
     def sent_by(self, schedules: Mapping[str, Schedule]) -> Frame:
-        """The same frame with other antenna schedules of some active terminals."""
+        """Return the frame with other antenna schedules of some active terminals."""
         s = self._setup
         sent = {
             name: s.transmission(name, self.number, self.poses[name], schedule)
@@ -118,7 +117,7 @@ class Frame:
         return self._setup.noise_power(self.poses, Link(*link))
 
     def ends(self, link: tuple[str, str]) -> Any:
-        """The hardware that shows in the samples of a link's receiver
+        """Return the hardware that affects the samples of a link's receiver
         (`isac_rt.extensions.hardware.front_end.Ends`)."""
         link, all_of = Link(*link), self._setup.front_ends
         senders = dict.fromkeys([link.tx, *self.sent])
@@ -126,18 +125,18 @@ class Frame:
         return extension("front_ends")(all_of[link.rx], tuple(each))
 
     def oscillator_noise_left_out(self, link: tuple[str, str]) -> float:
-        """Noise within a chirp that `samples` leave out, over the thermal noise."""
+        """Return the oscillator noise within a chirp that `samples` omit, over the thermal
+        noise."""
         link, power, waveform = Link(*link), self.noise_power(link), self._setup.waveform
         left_out = extension("hardware_noise_left_out")
         return float(left_out(waveform, self._arriving(link), self.ends(link), power))
 
     def samples(self, link: tuple[str, str], ends: Any = None) -> IFCube:
-        """IF samples of a link's receiver, dechirped in the resource blocks of the link's
-        transmitter, with noise; by other `ends` than the terminals' own hardware if there are some.
+        """Synthesise the IF samples of a link's receiver with noise, dechirped in the resource
+        blocks of the link's transmitter; `ends`: other hardware than the terminals' own.
 
-        What the other active terminals' chirps leave in these blocks is in the samples. They depend
-        on nothing but the frame and the link.
-        """
+        They include the chirps of other active terminals in these blocks, and depend on frame and
+        link alone."""
         link, s = Link(*link), self._setup
         arriving, noise = self._arriving(link), self._noise(link)
         method = s.plan.synthesis(sum(len(p) for _, p in arriving), noise.power)
@@ -151,25 +150,25 @@ class Frame:
         return noisy_if_signal(s.waveform, arriving, *received, method, noise)
 
     def received(self, link: tuple[str, str]) -> IFCube:
-        """The samples that a link's receiver is given, the board's errors taken out."""
+        """Return the samples of a link's receiver with the board's calibration applied."""
         return self._setup.calibrated(self.samples(link))
 
     def _arriving(self, link: Link) -> list[tuple[Transmission, PathSet]]:
-        """Return the signals at a link's receiver, its own transmitter's first; antennas that send
-        at once one by one."""
+        """Return the signals at a link's receiver, those of its transmitter first; antennas that
+        send at once are separate."""
         if link not in self.paths:
             received = ", ".join(map(str, self.paths))
             raise ValueError(f"{link} is not received in frame {self.number}; there are {received}")
         s, when = self._setup, self._setup.timetable.epoch(self.number, link.tx)
         out = []
         for name in dict.fromkeys([link.tx, *self.sent]):
-            clock = s.connections.apart(name, link, when)
+            clock = s.connections.clock_difference(name, link, when)
             sent = replace(self.sent[name], clock_offset=clock.offset, clock_drift=clock.drift)
             out += [(one, self.paths[Link(name, link.rx)]) for one in sent.streams()]
         return out
 
     def _listening(self, link: Link) -> tuple[ReceiveArray, Reference]:
-        """With what and when a link's receiver listens."""
+        """Return the receive array and the reference chirps of a link's receiver."""
         s = self._setup
         start = s.timetable.start_time(self.number, link.tx)
         return ReceiveArray(self.poses[link.rx], s.antennas), Reference(start)
@@ -182,7 +181,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Setup:
-    """Parts of a run that stay the same over all frames: `prepare` makes it.
+    """Parts of a run that are the same for all frames, built by `prepare`.
 
     Examples
     --------
@@ -212,7 +211,7 @@ class Setup:
     """What `prepare` took."""
 
     def with_antennas(self, antennas: Antennas) -> Setup:
-        """The same with other antennas, whose paths are found anew.
+        """Return the set-up with other antennas and newly traced paths.
 
         Raises
         ------
@@ -241,13 +240,13 @@ class Setup:
 
     @property
     def has_ideal_hardware(self) -> bool:
-        """True if no front end of the scenario departs from the ideal."""
+        """True if all front ends of the scenario are ideal."""
         s = self.scenario
         return all(s.front_end_of(name).ideal for name, u in s.swarm.items() if u.role != "target")
 
     @cached_property
     def front_ends(self) -> dict[str, Any]:
-        """The hardware of every terminal (`isac_rt.extensions.hardware.front_end.FrontEnd`)."""
+        """Hardware of each terminal (`isac_rt.extensions.hardware.front_end.FrontEnd`)."""
         s, make = self.scenario, extension("front_end")
         return {
             name: make(s.front_end_of(name), self.waveform, self.antennas, s.seed, name)
@@ -271,7 +270,7 @@ class Setup:
         return found
 
     def calibrated(self, cube: IFCube) -> IFCube:
-        """Samples without what the calibration says of the board."""
+        """Return samples with the calibration of the board applied."""
         if self.calibration is None:
             return cube
         corrected: IFCube = extension("calibrated")(self.calibration, cube)
@@ -279,32 +278,32 @@ class Setup:
 
     @cached_property
     def walls(self) -> Any:
-        """The city as terminals hold births and tracks against it
-        (`isac_rt.extensions.city_receivers.walls.Walls`)."""
+        """Terminals' model of the city, with which track initiation and track management test
+        detections (`isac_rt.extensions.city_receivers.walls.Walls`)."""
         return extension("walls")(self.city.without(self.scenario.belief.missing_m))
 
     def believed(self, pose: Pose) -> Pose:
-        """Return the pose that a terminal believes to have."""
+        """Return a pose with the navigation errors of `belief`."""
         belief = self.scenario.belief
         if belief == Belief():
             return pose
-        turn = Rotation.from_rotvec(np.radians(belief.attitude_deg)).as_matrix()
+        rotation = Rotation.from_rotvec(np.radians(belief.attitude_deg)).as_matrix()
         return replace(
             pose,
             position=pose.position + np.array(belief.position_m),
             velocity=pose.velocity + np.array(belief.velocity_mps),
-            rotation=turn @ pose.rotation,
+            rotation=rotation @ pose.rotation,
         )
 
     @property
     def mistakes(self) -> Mistakes:
-        """Return the terminals' errors about the clutter, their pose excluded."""
+        """Errors of the terminals' clutter model, besides their pose."""
         belief = self.scenario.belief
         return Mistakes(level_db=belief.level_db, mesh_std=belief.mesh_m, seed=self.scenario.seed)
 
     @cached_property
     def coverage(self) -> Coverage:
-        """Return the coverage of the links, and the part of the swarm outside it."""
+        """Coverage of the links, and the UAVs outside it."""
         s = self.scenario
         return coverage(self.swarm, self.timetable, self.antennas, s.receivers, s.schedule)
 
@@ -313,14 +312,14 @@ class Setup:
         return _noise_power(self.scenario, self.waveform, self.reference, poses, link)
 
     def frame(self, number: int) -> Frame:
-        """Trace a frame; what it sends is by the usual schedule."""
+        """Trace a frame, with the schedule of the scenario."""
         poses, traced = self._traced(number)
         return self.frame_of(number, poses, *traced)
 
     def frame_of(
         self, number: int, poses: dict[str, Pose], found: Mapping[Link, PathSet], dropped: int = 0
     ) -> Frame:
-        """The frame whose paths `find` found."""
+        """Build the frame from the paths of `find`."""
         kept = {
             link: self.plan.apply(paths, self.noise_power(poses, link))
             for link, paths in found.items()
@@ -338,7 +337,7 @@ class Setup:
         )
 
     def find(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
-        """Poses and all paths of a frame, however weak."""
+        """Return the poses and all paths of a frame, weak ones included."""
         poses, traced = self._traced(frame)
         return poses, traced.paths
 
@@ -354,8 +353,8 @@ class Setup:
     def transmission(
         self, active: str, frame: int, pose: Pose, schedule: Schedule | None = None
     ) -> Transmission:
-        """Return what an active terminal sends in a frame, by another `schedule` than the usual one
-        if there is one."""
+        """Return the transmission of an active terminal in a frame; `schedule`: other than that of
+        the scenario."""
         return Transmission(
             name=active,
             pose=pose,
@@ -381,7 +380,7 @@ class Setup:
 
 
 def link_budgets(setup: Setup) -> list[LinkBudget]:
-    """The link budget of every link at the first frame."""
+    """Return the link budget of each link at the first frame."""
     poses = setup.swarm.poses(setup.timetable.epoch(0))
     rows = []
     for link in setup.timetable.links(0):
@@ -412,8 +411,8 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
     Parameters
     ----------
     scenario : Scenario
-    store : where traced paths are looked up first and kept
-    digest : `city_digest`, where it is known already
+    store : cache of traced paths
+    digest : `city_digest`, if known
 
     Raises
     ------
@@ -519,8 +518,8 @@ def _noise_power(
 
 
 def noise_floor(scenario: Scenario, plan: Plan, reference: FreeSpace) -> NoiseFloor | None:
-    """Return the noise that covers each link's clutter; None where scatterers are not to be merged:
-    links that are found out in the run, mirrors, which bring clutter to other cells, and the preset
+    """Return the noise floor of each link for merging scatterers; None without merging: with links
+    established in the run, with mirrors, which bring clutter to other cells, and by the preset
     everything."""
     clutter, timetable = scenario.clutter, plan.timetable
     wanted = clutter.model == "field" and scenario.propagation.model == "ray_traced"
@@ -532,7 +531,7 @@ def noise_floor(scenario: Scenario, plan: Plan, reference: FreeSpace) -> NoiseFl
 def _floor_of(
     scenario: Scenario, plan: Plan, reference: FreeSpace, links: list[Link]
 ) -> NoiseFloor:
-    """Return the noise that covers some links' clutter."""
+    """Return the noise floor of some links."""
     timetable, frames = plan.timetable, plan.spread_frames()
     times = np.array([timetable.epoch(frame) for frame in frames])
     poses = [plan.swarm.poses(time) for time in times]
@@ -553,7 +552,7 @@ def _floor_of(
 
 
 def timetable_of(scenario: Scenario, waveform: Waveform, schedule: Schedule) -> Timetable:
-    """The frames that a scenario states."""
+    """Build the timetable of a scenario."""
     return Timetable(
         waveform=waveform,
         schedule=schedule,
@@ -569,7 +568,7 @@ def timetable_of(scenario: Scenario, waveform: Waveform, schedule: Schedule) -> 
 
 
 def plan_of(scenario: Scenario, antennas: Antennas, timetable: Timetable, swarm: Swarm) -> Plan:
-    """Return what a scenario asks to be modelled."""
+    """Build the plan of a scenario."""
     return Plan(
         scenario.accuracy,
         scenario.propagation,
@@ -581,8 +580,8 @@ def plan_of(scenario: Scenario, antennas: Antennas, timetable: Timetable, swarm:
 
 
 def _connected(setup: Setup) -> Setup:
-    """The same after the stages before the data, where the scenario has them; the last of their
-    frames ends by the first of the run's."""
+    """Return the set-up after the access stages of the scenario, whose last frame ends before the
+    first of the run."""
     s = setup.scenario
     clocks = {
         name: Clock(uav.clock_offset_s, uav.clock_drift_ppm * 1e-6)
@@ -600,20 +599,20 @@ def _connected(setup: Setup) -> Setup:
 
 
 def swarm_of(scenario: Scenario) -> Swarm:
-    """The scenario's UAVs and their flights."""
+    """Build the scenario's UAVs and their flights."""
     successors = tuple(change.to_uav for change in scenario.role_changes)
     return Swarm(scenario.swarm, scenario.flight_duration_s, successors)
 
 
 def city_of(scenario: Scenario, radius: float = np.inf) -> CityMesh:
-    """The scenario's city about the middle of the flight, as far as `radius` [m]; the same object
-    again for equal scenarios."""
+    """Return the scenario's city within `radius` [m] of the middle of the flights; equal scenarios
+    share one object."""
     centre, carrier = swarm_of(scenario).middle, scenario.radio.carrier_hz
     return city_about(centre, scenario.city, scenario.folder, carrier, radius)
 
 
 def propagation_in(city: CityMesh, scenario: Scenario, sample_spacing: float = 0.0) -> Propagation:
-    """The scenario's propagation model in a city, which need not be the scenario's own."""
+    """Return the scenario's propagation model in any city."""
     waveform, swarm = waveform_of(scenario.radio, scenario.array), swarm_of(scenario)
     antennas = antennas_of(scenario.array, waveform)
     free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
@@ -622,7 +621,7 @@ def propagation_in(city: CityMesh, scenario: Scenario, sample_spacing: float = 0
 
 
 def trace(scenario: Scenario, frame: int, *, setup: Setup | None = None) -> dict[Link, PathSet]:
-    """The paths of all links of one frame.
+    """Return the paths of all links of one frame.
 
     Examples
     --------

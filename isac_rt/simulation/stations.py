@@ -1,4 +1,4 @@
-"""Terminals of a run: each link's receiver with its score, and the sets that they form."""
+"""Terminals of a run: the receiver of each link with its scores, and sets of receivers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Terminal = ActiveTerminal | PassiveTerminal
 
 
 def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = None) -> Terminal:
-    """The receiver of a link as the scenario has it, or as a set of receivers to compare with.
+    """Return the receiver of a link by the settings of the scenario, or of a compared set.
 
     Examples
     --------
@@ -49,7 +49,7 @@ def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = N
 
 
 def terminal_with(setup: Setup, link: Link, made: Terminal | Receiver) -> Terminal:
-    """A terminal as it is, or the scenario's own with `made` as its receiver.
+    """Return `made` if it is a terminal, or the scenario's terminal with `made` as its receiver.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def terminal_with(setup: Setup, link: Link, made: Terminal | Receiver) -> Termin
 
 
 class Station:
-    """Receiving terminal of one link with its score."""
+    """Receiving terminal of one link with its scores."""
 
     def __init__(self, setup: Setup, link: Link, terminal: Terminal, receivers: Receivers) -> None:
         self.link, self.setup, self.terminal = link, setup, terminal
@@ -85,8 +85,8 @@ class Station:
         maps: bool,
         reports: Sequence[ReportedUav] = (),
     ) -> LinkResult:
-        """Receive one frame and track; `reports` are the targets that the receiver knows of from
-        others. Runs in a thread of its own; only this station's state changes."""
+        """Receive one frame and track; `reports` are targets reported by others. Runs in a thread
+        of its own and changes this station's state only."""
         begun = time.thread_time()
         timetable, (tx, rx) = self.setup.timetable, self.link
         when = timetable.epoch(frame.number, tx)
@@ -123,15 +123,15 @@ class Station:
         return LinkResult(reception, tracks, state, late)
 
     def _sender(self, when: float) -> Pose | None:
-        """Return where the link's transmitter reports to be; None: it reports nothing."""
+        """Return the reported pose of the link's transmitter; None without a report."""
         s = self.setup
         if s.scenario.cooperation == "none":
             return None
         return s.believed(s.swarm.trajectories[self.link.tx].pose(when))
 
     def _reported_poses(self, frame: int, when: float) -> list[Pose]:
-        """Return the poses that the other end of the link, or at an active terminal those of all
-        links, report, as far as the receiver asks."""
+        """Return the reported poses that the receiver uses: of the other end of the link, or at an
+        active terminal of all links."""
         s = self.setup
         if self.receivers.self_calibration != "positions":
             return []
@@ -140,7 +140,8 @@ class Station:
         return [s.believed(s.swarm.trajectories[name].pose(when)) for name in names if name != rx]
 
     def feed_back(self, frame: int, received: LinkResult, at_active: LinkResult) -> None:
-        """Exchange the passive terminal's feedback after a frame, and the active one's answer."""
+        """Exchange the feedback of the passive terminal after a frame, and the answer of the active
+        one."""
         if not isinstance(self.terminal, PassiveTerminal):
             return
         s, when = self.setup, self.setup.timetable.epoch(frame, self.link.tx)
@@ -159,8 +160,8 @@ class Station:
                 self.terminal.shorten(answer.cells, s.swarm.trajectories[self.link.rx].pose(when))
 
     def memory(self, carried: dict[str, Any] | None) -> dict[str, Any]:
-        """Return the state carried over to the next frame as plain numbers and arrays, for
-        `restore`; `carried` is the terminal's part of it where that is at work on a later frame."""
+        """Return the state after a frame as plain numbers and arrays, for `restore`; `carried` is
+        the terminal's part if it already works on a later frame."""
         return {
             "terminal": self.terminal.memory() if carried is None else carried,
             "scorer": self.scorer.memory(),
@@ -194,11 +195,11 @@ class Exchange(Protocol):
         ...
 
     def reports(self, link: Link, frame: int, time: float) -> list[ReportedUav]:
-        """Return the targets that a link's receiver knew of after a frame, at a time [s]."""
+        """Return the reported targets of a link's receiver after a frame, at a time [s]."""
         ...
 
     def memory(self) -> dict[str, Any]:
-        """Return the state carried over to the next frame, for `restore`."""
+        """Return the state after a frame, for `restore`."""
         ...
 
     def restore(self, memory: Mapping[str, Any]) -> None:
@@ -208,8 +209,7 @@ class Exchange(Protocol):
 
 @dataclass
 class StationSet:
-    """One set of receivers: the station of every link, the exchange between them, and the record
-    of what they receive."""
+    """One set of receivers: the station of each link, the exchange of reports, and the records."""
 
     stations: dict[Link, Station]
     recorder: Recorder
@@ -221,7 +221,7 @@ class StationSet:
     def of(
         cls, setup: Setup, terminal: Callable[[Link], Terminal], receivers: Receivers
     ) -> StationSet:
-        """Before the first frame; `receivers` are the settings that the terminals have."""
+        """Build the set before the first frame; `receivers` are the settings of the terminals."""
         timetable, cooperation = setup.timetable, setup.scenario.cooperation
         return cls(
             {link: Station(setup, link, terminal(link), receivers) for link in timetable.all_links},
@@ -232,8 +232,8 @@ class StationSet:
         )
 
     def reports(self, link: Link, frame: int) -> list[ReportedUav]:
-        """Return what the link's receiver knows from others in a frame: what it knew
-        `PREFETCHED_FRAMES` frames before, so that no frame waits for the one before."""
+        """Return the reports for a link's receiver in a frame: those of `PREFETCHED_FRAMES` frames
+        before, so that no frame waits for the previous one."""
         when = self.recorder.timetable.epoch(frame, link.tx)
         return self.exchange.reports(link, frame - PREFETCHED_FRAMES, when) if self.exchange else []
 
@@ -266,16 +266,15 @@ class StationSet:
                 self.recorder.amend(link, one)
 
     def blocks(self) -> dict[str, Any]:
-        """`terminals`, `links` and `swarm` of the summary."""
+        """Return `terminals`, `links` and `swarm` of the summary."""
         return self.recorder.blocks()
 
     def costs(self) -> dict[str, float]:
-        """Processor seconds of reception and tracking by link."""
+        """Return the processor seconds of reception and tracking by link."""
         return {str(link): o.seconds for link, o in self.stations.items()}
 
     def memory(self, first: int, carried: Mapping[Link, dict[str, Any]]) -> dict[str, Any]:
-        """Return the rows from a frame on, earlier ones that have changed, and what every terminal
-        carries over."""
+        """Return the rows from a frame on, changed earlier rows, and the state of each terminal."""
         recorder, exchange = self.recorder, self.exchange
         return {
             "rows": [recorder.row(i) for i in range(first, len(recorder))],
@@ -286,7 +285,7 @@ class StationSet:
         }
 
     def restore(self, memory: Mapping[str, Any]) -> None:
-        """Take up what the terminals carried over."""
+        """Restore the states of the terminals."""
         for link, station in self.stations.items():
             station.restore(memory["stations"][str(link)])
         if self.exchange is not None:

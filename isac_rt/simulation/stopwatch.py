@@ -1,4 +1,4 @@
-"""Where the time of a run goes: processor seconds of each stage, and wall seconds beside them."""
+"""Processor and wall seconds of each stage of a run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from isac_rt.results.recorder import STAGES
 
 
 class Seconds(NamedTuple):
-    """Duration of one stretch of work.
+    """Duration of one piece of work.
 
     Attributes
     ----------
@@ -32,12 +32,12 @@ class Seconds(NamedTuple):
 
     @classmethod
     def of_process(cls) -> Seconds:
-        """All threads of the process so far; the wall's zero is arbitrary."""
+        """Return the time of all threads of the process so far; wall time has an arbitrary zero."""
         return cls(time.process_time(), time.perf_counter())
 
     @classmethod
     def of_thread(cls) -> Seconds:
-        """The calling thread so far; the wall's zero is arbitrary."""
+        """Return the time of the calling thread so far; wall time has an arbitrary zero."""
         return cls(time.thread_time(), time.perf_counter())
 
 
@@ -60,13 +60,13 @@ class Stopwatch:
     _adding: threading.Lock = field(default_factory=threading.Lock)
 
     def set_up(self, seconds: Seconds) -> None:
-        """Count the set-up, which lies before the beginning."""
+        """Add the set-up, which precedes the start of the stopwatch."""
         self.spent["setup"] += seconds
         self.before += seconds
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Count what this thread does within."""
+        """Measure the time of this thread in a stage."""
         start = Seconds.of_thread()
         yield
         seconds = Seconds.of_thread() - start
@@ -74,8 +74,8 @@ class Stopwatch:
             self.spent[name] += seconds
 
     def so_far(self) -> dict[str, Any]:
-        """Processor seconds of every stage, ``other`` and ``total``; under ``wall`` the same by the
-        wall, without ``other``."""
+        """Return processor seconds of each stage, ``other`` and ``total``; under ``wall`` the wall
+        seconds, without ``other``."""
         total = self.before + (Seconds.of_process() - self.begun)
         processor = {name: one.processor for name, one in self.spent.items()}
         return {
@@ -86,7 +86,7 @@ class Stopwatch:
         }
 
     def restore(self, earlier: Mapping[str, Any]) -> None:
-        """Add what an earlier call of the same run had spent (`so_far`)."""
+        """Add the seconds of an earlier call of the same run (`so_far`)."""
         for name in STAGES:
             self.spent[name] += Seconds(earlier[name], earlier["wall"][name])
         self.before += Seconds(earlier["total"], earlier["wall"]["total"])

@@ -436,7 +436,7 @@ def _try(tree: dict[str, Any], folder: Path, entry: dict[str, Any], refuse: Any)
         Scenario.model_validate(with_tables(here, folder, replace=True))
     except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
         if not isinstance(error, ValidationError):
-            raise refuse(f"({shown}): the scenario has no such place; check the key") from None
+            raise refuse(f"({shown}): the scenario has no such key; check it") from None
         first = error.errors()[0]
         if first["type"] == "inconsistent":
             return

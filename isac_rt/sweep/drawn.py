@@ -312,8 +312,8 @@ def _move(
     points = _flown(tree)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     angle = rng.uniform(0, 2 * np.pi) if place.turn else 0.0
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    inside = (points[:, :2] - middle[:2]) @ turn.T
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    inside = (points[:, :2] - middle[:2]) @ rotation.T
     low, high = np.array(corner) - inside.min(axis=0), np.array(corner) + place.cell_m
     high = high - inside.max(axis=0)
     if (low > high).any():
@@ -322,7 +322,7 @@ def _move(
     to = np.append(rng.uniform(low, high), middle[2] + rng.uniform(*place.up_m))
 
     def turned(v: Any) -> list[float]:
-        return [*(turn @ np.asarray(v[:2], float)).tolist(), float(v[2])]
+        return [*(rotation @ np.asarray(v[:2], float)).tolist(), float(v[2])]
 
     def moved(v: Any) -> list[float]:
         return (np.array(turned(np.asarray(v, float) - middle)) + to).tolist()
@@ -384,7 +384,7 @@ def load_dataset(path: Path | str) -> DataPlan:
     try:
         _ = plan.scenes
     except (AttributeError, KeyError, IndexError, TypeError, ValueError) as problem:
-        said = f"the scenario has no such place ({problem}); check the keys"
+        said = f"the scenario has no such key ({problem}); check the keys"
         raise refuse(("draw",), said) from None
     except ScenarioError as problem:
         raise refuse(("place",) if data.place else ("draw",), str(problem)) from None

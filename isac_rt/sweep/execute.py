@@ -51,7 +51,7 @@ PATIENCE = 16
 many as it is given at once."""
 FOLLOWERS = 512
 """Points that may wait for others whose paths they share."""
-ROOM = 1_000_000
+FREE_BYTES = 1_000_000
 """Free disk without which no point is begun. [bytes]"""
 CACHE_BYTES = 4 * 1024**3
 
@@ -143,7 +143,7 @@ def _check_machine(job: Job, outcomes: Outcomes) -> None:
         raise MachineProblem(
             f"does not see {outcomes.points}; every worker must reach it under this path"
         )
-    if shutil.disk_usage(outcomes.points).free < ROOM:
+    if shutil.disk_usage(outcomes.points).free < FREE_BYTES:
         raise MachineProblem(f"no room is left in {outcomes.folder}; make room")
     found = ground_of(job.tree, Path(job.scenario_folder))
     if other := [name for name, value in job.ground.items() if found[name] != value]:

@@ -102,8 +102,8 @@ class _Moving:
             label=f"tracks of {dataset.observer.values[observer]}",
         )
         fused = {
-            str(dataset.receiver.values[observer]): ("s", 10, "its fused tracks"),
-            SWARM: ("D", 14, "fused tracks of the whole swarm"),
+            str(dataset.receiver.values[observer]): ("s", 10, "fused tracks"),
+            SWARM: ("D", 14, "fused tracks, swarm"),
         }
         alone = "" if "picture" in dataset.variables else "_"
         self._fused = {

@@ -78,11 +78,11 @@ def table(dataset: xr.Dataset, name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
 def _columns(key: str, v: xr.DataArray, rows: int) -> Iterator[tuple[str, xr.DataArray]]:
     """A variable's components as columns, named by their coordinates or numbers."""
     inside = v.dims[rows:]
-    for place in np.ndindex(*v.shape[rows:]):
-        part = v[dict(zip(inside, place, strict=True))]
+    for index in np.ndindex(*v.shape[rows:]):
+        part = v[dict(zip(inside, index, strict=True))]
         labels = [
             str(part.coords[dim].item() if dim in part.coords else i)
-            for dim, i in zip(inside, place, strict=True)
+            for dim, i in zip(inside, index, strict=True)
         ]
         yield "_".join([key, *labels]), part.drop_vars(inside, errors="ignore")
 

@@ -280,7 +280,7 @@ def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
     data = total[:, 0] > 0
     lost = data & ~dataset.decoded.values[:, observer]
     if lost.any():
-        label = f"not decided ({lost.sum()} of {data.sum()} frames)"
+        label = f"erased ({lost.sum()} of {data.sum()} frames)"
         ax.plot(t[lost], np.full(lost.sum(), 1.06), "x", color="#303030", ms=4, label=label)
     sender = list(dataset.uav.values).index(dataset.transmitter.values[observer])
     hidden = dataset.shadowed.values[:, observer, sender]

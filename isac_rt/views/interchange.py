@@ -285,11 +285,13 @@ def _world_angles(
     covariance by linear propagation."""
     body = np.maximum(unit_vector(u), [-1.0, 1e-6, -1.0])
     d, forward = rotation @ body, body[1]
-    turn = rotation @ np.array(
+    to_world = rotation @ np.array(
         [[1.0, 0.0], [-u[0] / forward, -u[1] / forward], [0.0, 1.0]]
     )  # d of direction by (u_x, u_z)
     level = d[0] ** 2 + d[1] ** 2
-    jacobian = np.array([turn[2] / np.sqrt(level), (d[0] * turn[1] - d[1] * turn[0]) / level])
+    jacobian = np.array(
+        [to_world[2] / np.sqrt(level), (d[0] * to_world[1] - d[1] * to_world[0]) / level]
+    )
     return np.array([np.arcsin(d[2]), np.arctan2(d[1], d[0])]), jacobian @ np.diag(
         std**2
     ) @ jacobian.T

@@ -174,10 +174,10 @@ def shade(city: CityMesh, view: View, width: int, height: int) -> tuple[np.ndarr
     step = np.abs(np.diff(np.where(seen, depth, 1e4), axis=1, prepend=1e4)) + np.abs(
         np.diff(np.where(seen, depth, 1e4), axis=0, prepend=1e4)
     )
-    turn = np.linalg.norm(np.diff(normal, axis=1, prepend=0), axis=-1) + np.linalg.norm(
+    curvature = np.linalg.norm(np.diff(normal, axis=1, prepend=0), axis=-1) + np.linalg.norm(
         np.diff(normal, axis=0, prepend=0), axis=-1
     )
-    edge = np.where((step > 3.0 + 8 * view.half[0] / width) | (turn > 0.5), 0.72, 1.0)
+    edge = np.where((step > 3.0 + 8 * view.half[0] / width) | (curvature > 0.5), 0.72, 1.0)
     picture[seen] = (base * (light * edge)[..., None])[seen]
     return picture, depth
 
@@ -298,10 +298,10 @@ def view_scene(
     legend = drawn.paths(paths, swarm.poses(time))
     level = float(tracks[..., 2].min() - 10)
 
-    def below(place: np.ndarray) -> float:
+    def below(point: np.ndarray) -> float:
         far = np.array([0.0, 0.0, FAR_DOWN_M])
-        _, share = hits(city.corners, place - city.origin, place - city.origin - far)
-        return float(place[2] - share.min() * FAR_DOWN_M) if share.size else level
+        _, share = hits(city.corners, point - city.origin, point - city.origin - far)
+        return float(point[2] - share.min() * FAR_DOWN_M) if share.size else level
 
     legend = drawn.swarm(swarm, times, time, below) + legend
     ax.legend(

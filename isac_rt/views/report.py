@@ -60,7 +60,8 @@ def walls(dataset: xr.Dataset, city: CityMesh) -> pd.DataFrame:
             {
                 "Surface": _words(city, int(faces[0])),
                 "Middle [m]": ", ".join(
-                    f"{x:.0f}" for x in city.corners[faces].mean(axis=(0, 1)) + city.origin
+                    f"{x:.0f}"
+                    for x in (city.corners[faces].mean(axis=(0, 1)) + city.origin).round() + 0.0
                 ),
                 **{name: int((mine.kind == kind).sum()) for name, kind in _KINDS.items()},
                 "Ghosts of": ", ".join(names[k] for k in sorted(set(ghosts))),
@@ -97,8 +98,16 @@ FIGURES = (
 """Beginnings of the names of figures that have a place on the page; others stand at its end."""
 
 
+_ROLES = {"active": "active terminal", "passive": "passive terminal", "target": "target"}
+
+
+def _count(number: int, what: str) -> str:
+    """Return a number with its noun."""
+    return f"{number} {what}{'s' * (number != 1)}"
+
+
 def _scene(dataset: xr.Dataset, city: CityMesh | None) -> tuple[str, str]:
-    """The 3-D scene of the run, or why there is none; empty where there is no city."""
+    """Return the 3-D scene of the run, or the reason without one; empty without a city."""
     if city is None or "track_state" not in dataset:
         return "", ""
     try:
@@ -110,6 +119,7 @@ def _scene(dataset: xr.Dataset, city: CityMesh | None) -> tuple[str, str]:
 def wall_table(dataset: xr.Dataset, city: CityMesh) -> Table:
     """The surfaces of the city that most detections came from, as `walls` finds them."""
     found = walls(dataset, city).head(MOST_WALLS)
+    found = found.loc[:, [found[name].astype(bool).any() for name in found]]  # what occurs
     return Table([*found.columns], [[number(v) for v in row] for row in found.values.tolist()])
 
 
@@ -146,7 +156,7 @@ def write_report(
     page = template.render(
         summary=s,
         span=f"{span:.2f} s",
-        roles=", ".join(f"{roles.count(r)} {r}" for r in dict.fromkeys(roles)),
+        roles=", ".join(_count(roles.count(r), _ROLES[r]) for r in dict.fromkeys(roles)),
         carrier=f"{radio.carrier_hz / 1e9:g} GHz",
         bandwidth=f"{radio.bandwidth_hz / 1e6:g} MHz",
         tables=tables,

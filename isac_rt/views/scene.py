@@ -124,7 +124,7 @@ def _line(where: Mapping[str, Any], colour: str, width: float, name: str, **more
     return {**kind, "line": line, **where, **more}
 
 
-def _uavs(names: Sequence[str], roles: Sequence[str], places: np.ndarray) -> Trace:
+def _uavs(names: Sequence[str], roles: Sequence[str], positions: np.ndarray) -> Trace:
     """Named markers of UAVs at places (U, 3) [m]."""
     marker = {
         "size": 6,
@@ -132,7 +132,7 @@ def _uavs(names: Sequence[str], roles: Sequence[str], places: np.ndarray) -> Tra
         "symbol": [ROLE_SYMBOLS[role] for role in roles],
     }
     kind = {"type": "scatter3d", "mode": "markers+text", "name": "UAVs"}
-    return {**kind, "text": list(names), "marker": marker, **points_of(places)}
+    return {**kind, "text": list(names), "marker": marker, **points_of(positions)}
 
 
 def _fixed(
@@ -173,13 +173,13 @@ def path_lines(dataset: xr.Dataset, rows: np.ndarray, most: int) -> Iterator[np.
     ledger; leakage has no line."""
     names, kind = list(dataset.uav.values), dataset.path_kind.values
     frames, observers = dataset.path_frame.values, dataset.path_observer.values
-    places, along = dataset.uav_position.values, dataset.path_points.values
+    positions, along = dataset.uav_position.values, dataset.path_points.values
     ends = [
         [names.index(end) for end in dataset[side].values] for side in ("transmitter", "receiver")
     ]
     rows = rows[kind[rows] != list(dataset.kind.values).index("leakage")]
     for k in rows[np.argsort(-dataset.path_power_db.values[rows], kind="stable")][:most]:
-        tx, rx = (places[frames[k], end[observers[k]]] for end in ends)
+        tx, rx = (positions[frames[k], end[observers[k]]] for end in ends)
         points = along[k]
         yield np.vstack([tx, points[np.isfinite(points).all(axis=1)], rx])
 
@@ -254,14 +254,14 @@ def moving_scene(dataset: xr.Dataset, city: CityMesh, reach: float = 120.0) -> d
     steps = np.unique(np.linspace(0, max(count - 1, 0), min(count, MOST_STEPS)).round().astype(int))
     moving = _Moving(dataset)
     frames = [moving.at(int(f)) for f in steps]
-    places = list(range(len(fixed), len(fixed) + len(moving.names)))
+    traces = list(range(len(fixed), len(fixed) + len(moving.names)))
     numbers = [str(int(dataset.frame.values[f])) for f in steps]
     start = frames[0] if frames else []
     return {
         "data": fixed + start,
         "layout": around | (_controls(dataset, steps, numbers) if len(steps) > 1 else {}),
         "frames": [
-            {"name": name, "data": data, "traces": places}
+            {"name": name, "data": data, "traces": traces}
             for name, data in zip(numbers, frames, strict=True)
         ],
     }
@@ -384,7 +384,10 @@ def page_part(figure: Mapping[str, Any], name: str) -> str:
     return (
         f"<script>{script}</script>\n"
         f'<div id="{name}"></div>\n<script>const {name} = {drawn};\n'
-        f"{name}.layout.showlegend = innerWidth > 700;\n"  # it would cover a phone's scene
+        f"if (innerWidth < 700) {{ const at = {name}.layout; at.showlegend = false;\n"
+        "if (at.sliders) { Object.assign(at.updatemenus[0], {x: 0, xanchor: 'left'});\n"
+        "Object.assign(at.sliders[0], {x: 0.35, len: 0.63}); }\n"
+        "const eye = at.scene.camera.eye; for (const k in eye) eye[k] *= 1.6; }\n"  # for phones
         f'Plotly.newPlot("{name}", {name}.data, {name}.layout, {{responsive: true}})'
         f'.then(() => Plotly.addFrames("{name}", {name}.frames));</script>'
     )

@@ -91,7 +91,7 @@ def hits(corners: np.ndarray, start: np.ndarray, end: np.ndarray) -> tuple[np.nd
     return near[through], share[through]
 
 
-def obstacles(city: CityMesh, places: np.ndarray) -> CityMesh:
+def obstacles(city: CityMesh, positions: np.ndarray) -> CityMesh:
     """Return the part of a city that UAVs may not be enclosed by: all of it, but for a room that
     encloses all of their places (N, 3), local.
 
@@ -108,25 +108,25 @@ def obstacles(city: CityMesh, places: np.ndarray) -> CityMesh:
         own = city.vertices[part == one]
         if (own.min(axis=0) == low).all() and (own.max(axis=0) == high).all():
             shell = part[city.faces[:, 0]] == one
-            if all(enclosed(city.of(shell), place) for place in places):
-                return obstacles(city.of(~shell), places)
-    if all(enclosed(city, place) and _looks_inward(city, place) for place in places):
+            if all(enclosed(city.of(shell), position) for position in positions):
+                return obstacles(city.of(~shell), positions)
+    if all(enclosed(city, position) and _looks_inward(city, position) for position in positions):
         return city.of(np.zeros(city.num_faces, bool))
     return city
 
 
-def _looks_inward(city: CityMesh, place: np.ndarray) -> bool:
+def _looks_inward(city: CityMesh, position: np.ndarray) -> bool:
     """Return whether most of the faces that a place (3,) sees are seen from their front."""
     reach = float(np.linalg.norm(np.ptp(city.vertices, axis=0)))
     ahead = 0
     for azimuth in 0.123 + np.arange(RING) * 2 * np.pi / RING:
         along = np.array([np.cos(azimuth), np.sin(azimuth), LOW_RAD])
-        face, share = hits(city.corners, place, place + reach * along)
+        face, share = hits(city.corners, position, position + reach * along)
         ahead += bool(face.size and city.normals[face[share.argmin()]] @ along < 0)
     return 2 * ahead > RING
 
 
-def enclosed(city: CityMesh, place: np.ndarray) -> bool:
+def enclosed(city: CityMesh, position: np.ndarray) -> bool:
     """Return whether a place (3,), local, lies inside a building or under the ground.
 
     Inside a building an odd number of faces lies above, and in most directions about, whether it
@@ -136,23 +136,23 @@ def enclosed(city: CityMesh, place: np.ndarray) -> bool:
     if not city.num_faces:
         return False
     low, high = city.bounds()
-    reach = float(np.linalg.norm(high - low)) + float(np.linalg.norm(place - (low + high) / 2))
+    reach = float(np.linalg.norm(high - low)) + float(np.linalg.norm(position - (low + high) / 2))
 
     def count(elevation: float, azimuth: float) -> int:
         level = np.cos(elevation)
         towards = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
-        end = place + reach * np.array(towards)
-        near = city.corners[_beside(city, np.stack([place, end]), slice(None))]
-        return len(hits(near, place, end)[0])
+        end = position + reach * np.array(towards)
+        near = city.corners[_beside(city, np.stack([position, end]), slice(None))]
+        return len(hits(near, position, end)[0])
 
     # no direction is along an edge of what people build: an edge would count twice
     above = count(np.pi / 2 - 1e-4, 0.37)
     if not above:
         return False
-    turns = 0.123 + np.arange(RING) * 2 * np.pi / RING
-    odd = sum(count(LOW_RAD, turn) % 2 for turn in turns)
+    azimuths = 0.123 + np.arange(RING) * 2 * np.pi / RING
+    odd = sum(count(LOW_RAD, azimuth) % 2 for azimuth in azimuths)
     if above % 2 and 2 * odd > RING:
         return True
     if count(-np.pi / 2 + 1e-4, 0.37):
         return False
-    return all(count(HIGH_RAD, turn) for turn in turns)
+    return all(count(HIGH_RAD, azimuth) for azimuth in azimuths)

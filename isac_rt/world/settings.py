@@ -275,7 +275,7 @@ class Formation(Node):
     """How many there are, the one that is stated included; they get its name with _1, _2 and so
     on."""
 
-    def places(self) -> list[tuple[float, float]]:
+    def positions(self) -> list[tuple[float, float]]:
         """(right, ahead) of each [m], the first at (0, 0)."""
         out = []
         width = math.ceil(math.sqrt(self.count))
@@ -409,7 +409,7 @@ class Uav(Node):
                     (("waypoints", i, "time_s"), ("waypoints", i, "position_m")), _too_fast(speed)
                 )
 
-    def place(self, time: float) -> tuple[float, ...]:
+    def position_at(self, time: float) -> tuple[float, ...]:
         """Position [m] with straight lines between waypoints: near enough to judge an input, not to
         fly by."""
         if self.waypoints is None:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from isac_rt.world.settings import Uav
 
 SAG_M = 0.01
-MOST_PLACES = 20_000
+MAX_POINTS = 20_000
 """A flight that would need more is followed less closely."""
 
 
@@ -164,7 +164,7 @@ class Trajectory:
             knots = self._spline.x[(self._spline.x > start) & (self._spline.x < end)]
             bends = np.linalg.norm(self._spline(np.clip(self._spline.x, start, end), 2), axis=1)
             count = int((end - start) * np.sqrt(bends.max() / (8 * SAG_M))) + 2
-            times = np.union1d(np.linspace(start, end, min(count, MOST_PLACES)), knots)
+            times = np.union1d(np.linspace(start, end, min(count, MAX_POINTS)), knots)
         return times, np.array([self.pose(float(t)).position for t in times])
 
 

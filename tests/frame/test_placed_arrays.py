@@ -60,7 +60,7 @@ def test_cascade_row_has_86_azimuth_places():
 
 @pytest.mark.parametrize(
     ("tx", "said"),
-    [([], "needs places"), ([(0, 0, 1)], "needs places"), ([(0, np.nan)], "finite numbers")],
+    [([], "needs positions"), ([(0, 0, 1)], "needs positions"), ([(0, np.nan)], "finite numbers")],
 )
 def test_places_that_are_none_are_refused(tx, said):
     """Bug: an empty list that makes an array without elements."""

@@ -273,7 +273,7 @@ def test_cells_of_range_spectra(turned: bool):
         power, tapered = np.zeros((2, chirps, size), np.float32)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(spectrum, "fill_cells", chosen)
-            more = {"turn": turn, "power": power, "tapered": tapered}
+            more = {"phasor": turn, "power": power, "tapered": tapered}
             spectrum.transform(samples, factor, cells, out, **more)
         results.append((out, power, tapered))
     for found, expected in zip(*results, strict=True):

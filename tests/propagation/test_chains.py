@@ -17,7 +17,7 @@ pytestmark = pytest.mark.sionna
 C, F_C = 299_792_458.0, 77e9
 TIMES = np.linspace(0.013, 0.913, 13)
 AMPLITUDE = 2e-4  # Sionna's float32 through Fresnel's square roots
-ASIDE = (
+PROBES_M = (
     1e-2  # of corners, to which the tracer measures 0.1 m beside the terminal, 14 m and more away
 )
 LINKS = [("A", "A"), ("A", "P")]
@@ -137,7 +137,7 @@ def test_the_paths_are_those_of_sionnas_solver(streets):
             one, other = full[link].gain[list(a.values())], got[link].gain[[b[k] for k in a]]
             corner = (link == ("A", "A")) & (full[link].bounces[list(a.values())] > 1)
             error = np.abs(other - one) / np.abs(one).max()
-            assert (error < np.where(corner, ASIDE, AMPLITUDE)).all()
+            assert (error < np.where(corner, PROBES_M, AMPLITUDE)).all()
         keys.append({tuple(row) for row in got["A", "P"].faces.tolist()})
     assert len(set.union(*keys)) > len(keys[0]) != len(keys[-1])  # they do come and go
 

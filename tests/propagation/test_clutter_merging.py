@@ -20,7 +20,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.cells import Cells, Density, cut
 from isac_rt.propagation.clutter.field import in_local
 from isac_rt.propagation.clutter.merging import (
-    EASED,
+    LIMIT_FACTORS,
     VisibleCells,
     allowed_area,
     merge,
@@ -153,9 +153,9 @@ def test_allowed_areas_are_those_of_the_rule():
     assert found[102] == pytest.approx(1.7 * most / 0.004, rel=1e-12)
     assert found[102] < 2.1 * (1.004 / 0.004) ** (4 / 3)
     assert found[103] == pytest.approx(1.7 * 4.0 * 0.2**2 * 1.8**2 / 0.8 / 0.8, rel=1e-12)
-    eased = allowed_area(heard, area, np.full(power.size, 2.1), 0.2, 3.0)
-    assert eased[:102] == pytest.approx(found[:102], rel=1e-12)
-    assert eased[102:] == pytest.approx(3.0 * found[102:], rel=1e-12)
+    factor = allowed_area(heard, area, np.full(power.size, 2.1), 0.2, 3.0)
+    assert factor[:102] == pytest.approx(found[:102], rel=1e-12)
+    assert factor[102:] == pytest.approx(3.0 * found[102:], rel=1e-12)
 
 
 def nine_of_ten(cells: Cells, place, left: Cells, heard: VisibleCells, least: float) -> float:
@@ -185,17 +185,17 @@ def test_the_rule_is_eased_as_far_as_the_error_allows(level, expected):
         heard.append(VisibleCells(index, power, cells.points[index] @ [0.9, 2.3, 1.1] // 2.7))
     heard = [h._replace(cell=h.cell.astype(int) - int(h.cell.min())) for h in heard]
     found = merged_below_noise(cells, heard, finest, 0.2)
-    for eased in EASED:
+    for factor in LIMIT_FACTORS:
         limit = np.full(len(cells), np.inf)
         for some in heard:
-            allowed = allowed_area(some, cells.area, finest, 10**0.02 - 1, eased)
+            allowed = allowed_area(some, cells.area, finest, 10**0.02 - 1, factor)
             limit[some.which] = np.minimum(limit[some.which], allowed)
         place, left = merge(cells, limit)
         mine = cells, place, left
         worst = max(nine_of_ten(*mine, some, least) for some in heard for least in (0.0, 1.0))
         if worst <= 0.2:
             break
-    assert eased == expected
+    assert factor == expected
     assert np.array_equal(found.area, left.area)
 
 

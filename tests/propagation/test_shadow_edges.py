@@ -262,7 +262,7 @@ def test_no_edge_near_a_path_is_passed_over(together, monkeypatch):
     """Triangles strewn over 200 m, edges of 1 to 60 m: the shortest detours of paths against a
     search along every edge, by thirds. Planted bugs: balls about blocks that hold the middles of
     their edges alone; a last block without its edges."""
-    monkeypatch.setattr(edges_of_cities, "TOGETHER", together)
+    monkeypatch.setattr(edges_of_cities, "EDGES_PER_BLOCK", together)
     rng = np.random.default_rng(5)
     size = 10 ** rng.uniform(0, 1.5, (333, 1, 1))
     corners = rng.uniform(-100, 100, (333, 1, 3)) + size * rng.uniform(-1, 1, (333, 3, 3))

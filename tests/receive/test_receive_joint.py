@@ -15,7 +15,7 @@ from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.arms import element_delays
-from isac_rt.receive.joint.fit import Fit, _Descent, energy, fit, places, residual_channels
+from isac_rt.receive.joint.fit import Fit, _Descent, cell_positions, energy, fit, residual_channels
 from isac_rt.receive.joint.interaction import IGNORED, TANGENTS, clusters, ignored, shared
 from isac_rt.receive.joint.moments import Moments, _weights
 from isac_rt.receive.joint.neighbours import (
@@ -621,7 +621,7 @@ def test_what_is_ignored_moves_an_estimate_by_no_more_than_is_said():
         ]
         J = np.stack([*columns, unit, 1j * unit], axis=1)
         F = np.linalg.inv((J.conj().T @ J).real)
-        where = places(sent, [at_place(w, p) for p in (first, *others)])
+        where = cell_positions(sent, [at_place(w, p) for p in (first, *others)])
         share = shared(sent, where, where)[0, 1:]
         for other, c in zip(others, share, strict=True):
             moved = F @ (J.conj().T @ signal(w, schedule, payload, other, 1).ravel()).real
@@ -703,7 +703,7 @@ def test_work_grows_with_the_paths_that_touch():
 
     def work(where: list[list[float]]) -> tuple[int, int]:
         paths = [at_place(w, np.array([*p, 0.1, 0.1])) for p in where]
-        share = shared(sent, places(sent, paths), places(sent, paths))
+        share = shared(sent, cell_positions(sent, paths), cell_positions(sent, paths))
         np.fill_diagonal(share, 0)
         felt = ~ignored(share, np.full(len(paths), energy_of_one))
         np.fill_diagonal(felt, False)

@@ -38,17 +38,17 @@ def test_transform_is_the_sum(size: int, chirps: int, plain: bool):
     rng = np.random.default_rng(size)
     samples, factor = drawn(rng, 2, chirps, size), drawn(rng, chirps, size)
     cells = np.array([-3, 0, 5, size // 2 + 1, size - 3])  # the first and the last are one
-    turn, power, tapered, out = (
+    phasor, power, tapered, out = (
         drawn(rng, cells.size, chirps),
         np.full((chirps, size), 0.37, np.float32),
         np.full((chirps, size), 0.21, np.float32),
         np.empty((2, 5, chirps), np.complex64),
     )
     method = transform_plain if plain else transform
-    method(samples, factor, cells, out, turn=turn, power=power, tapered=tapered)
+    method(samples, factor, cells, out, phasor=phasor, power=power, tapered=tapered)
     wave = np.exp(-2j * np.pi * np.outer(np.arange(size), np.arange(size)) / size)
     every = np.einsum("kn,rpn->rpk", wave, samples.astype(complex) * factor)
-    expected = every[:, :, cells % size].transpose(0, 2, 1) * turn
+    expected = every[:, :, cells % size].transpose(0, 2, 1) * phasor
     assert np.linalg.norm(out - expected) < ROUNDING * np.linalg.norm(expected)
     added = (np.abs(every) ** 2).sum(axis=0)
     assert np.linalg.norm(power - 0.37 - added) < ROUNDING * np.linalg.norm(added)

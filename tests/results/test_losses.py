@@ -18,7 +18,7 @@ from isac_rt.receive.cfar import CfarRule
 from isac_rt.receive.maps import channel_maps, power_map
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.results.labels import Places, hann_response
+from isac_rt.results.labels import MapPositions, hann_response
 from isac_rt.results.losses import Chance, Channels, Loss, Sensitivity, cause_of, single_look
 from isac_rt.world.swarm import Pose
 
@@ -63,7 +63,7 @@ def echo(length, rate, amplitude, others=(), u=0.0):
 def chance_of(paths, sees=SEES, waveform=W) -> Chance:
     wavenumber = 2 * np.pi * float(waveform.carrier()) / SPEED_OF_LIGHT
     channels = Channels(ANTENNAS, wavenumber, Pose.at_rest(), Pose.at_rest())
-    return Chance.of(0, paths, Places.of(paths, waveform, 2), waveform, sees, channels)
+    return Chance.of(0, paths, MapPositions.of(paths, waveform, 2), waveform, sees, channels)
 
 
 @pytest.mark.parametrize(("bins", "rows"), [(3.0, 11.0), (3.5, 11.0), (-2.3, 17.4)])

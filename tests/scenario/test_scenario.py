@@ -148,7 +148,7 @@ def test_scenes_load_without_doubts_and_round_trip(path, tmp_path):
         ),
         (
             BASE + "compare: {a: {receivers: {active_every_frames: 3}}}\n",
-            "s.yaml:4: compare.a.receivers.active_every_frames = 3: every set hears the same "
+            "s.yaml:4: compare.a.receivers.active_every_frames = 3: every set receives the same "
             "samples, and receivers.active_every_frames is 1; leave it out",
         ),
         (

@@ -16,7 +16,7 @@ from isac_rt.frame.payload import random_payload
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform, hann
 from isac_rt.kernels.fourier import ROW, plan, transform
-from isac_rt.kernels.signal_below_noise import LINES, TOGETHER, batches, below_noise_error
+from isac_rt.kernels.signal_below_noise import CHIRPS_PER_BATCH, LINES, batches, below_noise_error
 from isac_rt.kernels.signal_direct import add_direct
 from isac_rt.kernels.signal_gridded import (
     GRIDDED_ERROR,
@@ -231,8 +231,8 @@ def test_noise_is_that_of_its_own_pass(samples):
 def test_error_of_paths_that_noise_covers(speed, size, change):
     """The stated bound of each of eight paths, which lies within four times of the truth: over a
     whole frame, with few and many chirps of an element at once, larger arrays and bandwidths.
-    Planted bugs: `late` of zero; `MOVED` of 2 in `part_slots` alone; `beyond` without the elements'
-    delays; `_apart` of 0."""
+    Planted bugs: `late` of zero; `MAX_LINE_SHIFT` of 2 in `part_slots` alone; `beyond` without the
+    elements' delays; `_time_spread` of 0."""
     count = 8
     w, t = scene(count, np.random.default_rng(23), speed=speed, **({"num_chirps": 60} | change))
     t = t._replace(
@@ -298,7 +298,7 @@ def test_every_chirp_is_made_once_with_others_of_its_element():
     antenna = np.random.default_rng(27).integers(0, 3, (3, 50))
     chirp, parts = batches(antenna, 24)
     assert sorted(chirp.tolist()) == list(range(150))
-    assert parts[:, 1].sum() == 150 and parts[:, 1].max() <= TOGETHER
+    assert parts[:, 1].sum() == 150 and parts[:, 1].max() <= CHIRPS_PER_BATCH
     for first, count, part in parts:
         some = chirp[first : first + count]
         assert len(set(antenna.ravel()[some])) == 1

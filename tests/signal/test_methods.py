@@ -66,9 +66,9 @@ def test_what_noise_covers_is_decided_cell_by_cell():
 
     error = below_noise_error(w, t, grid_size(w.num_samples, OVERSAMPLING, WIDTH))
     sums = [(power * error**2)[some].sum() for some in (slice(0, 32), slice(32, 64))]
-    for share, covered in ((0.5 * sums[0], 0), (2 * sums[0], 32), (2 * sums[1], 64)):
-        method = Auto(noise_power=1.0, covered=share * size, max_direct=0)
-        assert method.choose(w, t)[1].sum() == covered
+    for share, below_noise in ((0.5 * sums[0], 0), (2 * sums[0], 32), (2 * sums[1], 64)):
+        method = Auto(noise_power=1.0, below_noise=share * size, max_direct=0)
+        assert method.choose(w, t)[1].sum() == below_noise
 
 
 def test_synthesis_is_its_twin():

@@ -139,8 +139,8 @@ def test_estimates_bound_the_truth_and_exceed_it_by_ten_at_most_in_nine_of_ten()
             if row["left_out_db"] is not None and not row["missed_chains"]:
                 pairs.append((10 ** (items["paths", link] / 20), 10 ** (row["left_out_db"] / 20)))
             assert row["synthesis"] <= 1e-4
-            if row["covered_db"] is not None:
-                assert row["covered_db"] < row["covered_bound_db"] == -20.0
+            if row["below_noise_db"] is not None:
+                assert row["below_noise_db"] < row["below_noise_bound_db"] == -20.0
             for estimate, truth in pairs:
                 if truth > 0:
                     assert truth <= estimate * 1.02, (seed, link)

@@ -153,7 +153,7 @@ def test_reflections_at_a_passive_terminal_by_hand():
         "NEAR": body("target", (0, out[0] - base / 2, 40.0)),
         "FAR": body("target", (0, out[1] - base / 2, 40.0)),
     }
-    with pytest.warns(ScenarioWarning, match="P never sees A"):
+    with pytest.warns(ScenarioWarning, match="A is outside the coverage of P"):
         rows = prepare(scenario(swarm)).coverage.outside
     at_p = {row.uav: row for row in rows if row.link == "A->P"}
     assert "NEAR" not in at_p
@@ -184,7 +184,9 @@ def test_who_is_never_seen_is_named_before_the_run():
     """With the cause on each link; who is seen once is not. Planted bug: any link in place of
     every."""
     behind = {**PAIR, "U": body("target", (0, -9.0, 40.0))}
-    with pytest.warns(ScenarioWarning, match=r"no terminal ever sees U \(A to A: out "):
+    with pytest.warns(
+        ScenarioWarning, match=r"U: outside the coverage of all terminals \(A to A: out"
+    ):
         prepare(scenario(behind))
     passing = {**PAIR, "U": body("target", (0, -3.0, 43.0), velocity_mps=(0, 9.0, 0))}
     with warnings.catch_warnings():

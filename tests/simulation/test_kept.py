@@ -86,7 +86,7 @@ def place(tmp_path, monkeypatch):
     """A folder with a city, and one for what is kept."""
     quarter = Path(__file__).parents[2] / "scenes/data/quarter.geojson"
     shutil.copy(quarter, tmp_path / "quarter.geojson")
-    monkeypatch.setattr(mesh, "FACES_KEPT", 10)
+    monkeypatch.setattr(mesh, "MIN_CACHED_FACES", 10)
     monkeypatch.setenv(KEPT, str(tmp_path / "kept"))
     return tmp_path
 

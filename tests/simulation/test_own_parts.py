@@ -137,7 +137,7 @@ def test_a_row_says_so_before_the_run():
     """Its elevation beam is none, and a run warns; bug: a beam of 90 degrees."""
     row = {"shape": "linear", "columns": 3}
     tree = {**TREE, "array": {"tx": row, "rx": row, "element_pattern": "isotropic"}}
-    with pytest.warns(ScenarioWarning, match="does not observe elevation; tracks take bodies"):
+    with pytest.warns(ScenarioWarning, match="does not observe elevation; tracks assume UAVs"):
         setup = prepare(load({**tree, "array": {**tree["array"], "element_gain_dbi": 0}}))
     beams = [link.elevation_resolution_deg for link in setup.coverage.links]
     assert beams == [None, None] and setup.coverage.links[0].azimuth_resolution_deg is not None

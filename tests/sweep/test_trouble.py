@@ -25,7 +25,7 @@ from isac_rt.propagation.store import PathStore
 from isac_rt.results.files import ResultsError
 from isac_rt.sweep import Outcomes, PointsLeft, execute, open_sweep, run_sweep, save_dataset, status
 from isac_rt.sweep.definition import Point
-from isac_rt.sweep.execute import ROOM, run_job
+from isac_rt.sweep.execute import FREE_BYTES, run_job
 from isac_rt.sweep.outcomes import _checksum
 from isac_rt.sweep.workers import Ended
 
@@ -175,7 +175,7 @@ def full(monkeypatch, outcomes, folder):
 
 
 def nearly_full(monkeypatch, outcomes, folder):
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=ROOM - 1))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=FREE_BYTES - 1))
     return "no room is left"
 
 

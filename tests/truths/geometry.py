@@ -16,9 +16,9 @@ from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.legs.geometry import Legs, plane_of_each_face, straight, unfold
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.world.city import load_city
+from isac_rt.world.city.georeference import LONLAT, GeoReference, plane_about
 from isac_rt.world.city.materials import MaterialUse
 from isac_rt.world.city.mesh import clean
-from isac_rt.world.city.place import LONLAT, Place, plane_about
 from isac_rt.world.city.prism import Finish
 from isac_rt.world.swarm import Pose, Trajectory
 from truths import stage, truths
@@ -406,7 +406,7 @@ def longitude_and_latitude_to_metres() -> float:
     lat, away = 48.137, np.array([-0.0143, 0.0027, 0.0269])
     a, f = 6378137.0, 1 / 298.257223563
     e2 = f * (2 - f)
-    place = Place(LONLAT, (11.575, lat, 0.0), plane_about(11.575, lat))
+    place = GeoReference(LONLAT, (11.575, lat, 0.0), plane_about(11.575, lat))
     found = place.to_world(np.column_stack([np.full(3, 11.575), lat + away]))[:, 1]
     arcs = [
         quad(

@@ -118,7 +118,7 @@ def test_walls_behind_what_was_seen():
     table = wall_table(d, city)
     first, second = (dict(zip(table.columns, r, strict=True)) for r in table.rows)
     assert first["Surface"].endswith("facing east") and second["Surface"].endswith("level")
-    assert (first["Diffuse"], first["Ghosts"], first["Mirror images"]) == ("2", "1", "0")
+    assert (first["Diffuse"], first["Ghosts"]) == ("2", "1") and "Mirror images" not in first
     assert first["Ghosts of"] == "U7" and second["Ghosts of"] == ""
     x, y, z = (float(v) for v in first["Middle [m]"].split(","))
     np.testing.assert_allclose([x, y, z], middle[facade[0]], atol=0.5)

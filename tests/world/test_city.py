@@ -15,6 +15,7 @@ import trimesh
 from isac_rt import scenario
 from isac_rt.extensions.city_files.extrude import building
 from isac_rt.world.city import CityError, CityMesh, load_city, parametric
+from isac_rt.world.city.georeference import is_lonlat
 from isac_rt.world.city.materials import (
     KNOWN_MATERIALS,
     MaterialUse,
@@ -22,7 +23,6 @@ from isac_rt.world.city.materials import (
 )
 from isac_rt.world.city.mesh import Surface, clean, distance_to_triangles
 from isac_rt.world.city.meshfiles import _triangles
-from isac_rt.world.city.place import is_lonlat
 from isac_rt.world.city.prism import Finish
 from isac_rt.world.settings import City
 

@@ -31,8 +31,8 @@ from isac_rt.scenario.file import load
 from isac_rt.sweep import load_sweep
 from isac_rt.world.area import city_about, city_digest
 from isac_rt.world.city import CityError, city_files, load_city, meshfiles
+from isac_rt.world.city.georeference import crs_name
 from isac_rt.world.city.materials import MAX_MATERIALS
-from isac_rt.world.city.place import crs_name
 
 SECONDS = 8.0
 """For any file of these tests on a loaded machine; each takes well below one."""

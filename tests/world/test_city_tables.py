@@ -94,8 +94,8 @@ def test_tables_are_read_with_their_reference_system(kind, tmp_path):
     table().to_parquet(file) if kind == "parquet" else table().to_file(file)
     city = read(tmp_path, file.name)
     assert volume(city) == pytest.approx(VOLUME, rel=1e-6)
-    assert city.place is not None
-    assert city.place.crs == "EPSG:2056"
+    assert city.georeference is not None
+    assert city.georeference.crs == "EPSG:2056"
     named = {
         f.name for f in city_files(scenario.City(source="footprints", file=file.name), tmp_path)
     }

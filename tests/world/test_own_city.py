@@ -267,10 +267,10 @@ def test_sizes_are_true_in_every_reference_system(crs, by_key, tmp_path):
     sides = np.linalg.norm(corners[:, None] - corners[None], axis=2)
     found = sides.ravel()[np.argmin(np.abs(sides - wide))]
     assert found == pytest.approx(wide, rel=5e-4)
-    assert city.place is not None
-    assert city.place.crs == crs
-    back = city.place.to_file(city.vertices + city.origin)
-    assert city.place.to_world(back) == pytest.approx(city.vertices + city.origin, abs=1e-6)
+    assert city.georeference is not None
+    assert city.georeference.crs == crs
+    back = city.georeference.to_file(city.vertices + city.origin)
+    assert city.georeference.to_world(back) == pytest.approx(city.vertices + city.origin, abs=1e-6)
 
 
 def test_an_origin_makes_a_national_grid_local(tmp_path):
@@ -518,8 +518,8 @@ def test_cityjson_by_lines_and_one_bad_object(tmp_path):
     city = read(tmp_path, "c.city.jsonl", **LOCAL)
     assert body(city).volume == pytest.approx(3 * 1000)
     assert said(city, "1 of 4 objects left out", "vertex 99")
-    assert city.place is not None
-    assert city.place.crs == "EPSG:2056"
+    assert city.georeference is not None
+    assert city.georeference.crs == "EPSG:2056"
 
 
 @pytest.mark.parametrize(

@@ -311,7 +311,7 @@ def test_a_flight_in_utm_is_read_with_the_citys_origin(tmp_path):
         ("time_s,lat,lon", (48, 11), "", "or time_s, lat, lon, alt"),
     ],
 )
-def test_a_flight_that_no_map_places_says_what_to_state(tmp_path, header, row, city, said):
+def test_a_flight_that_no_map_georeferences_says_what_to_state(tmp_path, header, row, city, said):
     """In one message with the key."""
     quarter(tmp_path)
     with pytest.raises(ScenarioError, match=said) as refused:

@@ -37,7 +37,7 @@ def test_a_city_fills_the_box_of_its_vertices(name, crs, says):
     assert low[:2] == pytest.approx(places.min(axis=0)[:2] - MARGIN, abs=1e-3)
     assert high[:2] == pytest.approx(places.max(axis=0)[:2] + MARGIN, abs=1e-3)
     assert (low[2], high[2]) == pytest.approx((places[:, 2].min(), places[:, 2].max()), abs=1e-3)
-    assert city.place is not None and city.place.crs == crs
+    assert city.georeference is not None and city.georeference.crs == crs
     assert any(says in note for note in city.notes)
 
 

@@ -136,12 +136,12 @@ def test_places_on_straight_lines():
     """A flight's place to judge an input by: between two waypoints in proportion, beyond them
     along the last line. Planted bugs: time counted from zero; the wrong stretch."""
     uav = Uav(role="target", waypoints=WAYPOINTS)
-    assert uav.place(0.65) == pytest.approx((4.25, 5.4, 21.4))
-    assert uav.place(2.1) == pytest.approx((12.8, 8.95, 24.0))
-    assert uav.place(2.9) == pytest.approx((17.4, 8.8, 25.3))
-    assert uav.place(4.7) == pytest.approx((25.65, -9.05, 23.65))
+    assert uav.position_at(0.65) == pytest.approx((4.25, 5.4, 21.4))
+    assert uav.position_at(2.1) == pytest.approx((12.8, 8.95, 24.0))
+    assert uav.position_at(2.9) == pytest.approx((17.4, 8.8, 25.3))
+    assert uav.position_at(4.7) == pytest.approx((25.65, -9.05, 23.65))
     straight = Uav(role="target", position_m=(1, 2, 3), velocity_mps=(0.5, -4, 0.25))
-    assert straight.place(2.0) == (2.0, -6.0, 3.5)
+    assert straight.position_at(2.0) == (2.0, -6.0, 3.5)
 
 
 def test_a_swarm_by_roles_and_its_middle():

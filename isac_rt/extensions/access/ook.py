@@ -129,9 +129,9 @@ class Codebook:
                 f"{message} does not fit {self.num_senders} senders and {self.num_blocks} blocks"
             )
         bits = [
-            (value >> place) & 1
+            (value >> bit_index) & 1
             for (value, _), width in zip(fields, self.widths, strict=True)
-            for place in range(width - 1, -1, -1)
+            for bit_index in range(width - 1, -1, -1)
         ]
         return np.array([*bits, (sum(bits) + 1) % 2], np.uint8)
 
@@ -234,11 +234,11 @@ def _stretches(samples: np.ndarray, fraction: float, each: int, count: int) -> n
     """(count, N) mean energy of the cells k + fraction over the groups, antennas and chirps of each
     stretch."""
     num_samples = samples.shape[-1]
-    turn = np.exp(-2j * np.pi * fraction * np.arange(num_samples) / num_samples).astype(
+    phasor = np.exp(-2j * np.pi * fraction * np.arange(num_samples) / num_samples).astype(
         np.complex64
     )
     total = np.zeros((count, num_samples))
     for one in samples.reshape(-1, *samples.shape[2:]):
-        spectra = scipy.fft.fft(one[: count * each] * turn, axis=1, workers=1, overwrite_x=True)
+        spectra = scipy.fft.fft(one[: count * each] * phasor, axis=1, workers=1, overwrite_x=True)
         total += (spectra.real**2 + spectra.imag**2).reshape(count, each, num_samples).sum(axis=1)
     return total / (samples.shape[0] * samples.shape[1] * each)

@@ -234,9 +234,9 @@ class _Air:
         links = []
         for t in every:
             clock = n.clocks.get(t.name, Clock())
-            apart = clock.late(self.time) - own.late(self.time)
+            difference = clock.late(self.time) - own.late(self.time)
             shifted = replace(
-                t, clock_offset=t.clock_offset + apart, clock_drift=clock.drift - own.drift
+                t, clock_offset=t.clock_offset + difference, clock_drift=clock.drift - own.drift
             )
             links.append((shifted, paths[Link(t.name, name)]))
         start = self.time - w.frame_duration / 2 + first_block * w.group_spacing

@@ -140,8 +140,8 @@ def measured_alone(detections: Detections, cube: IFCube, antennas: Antennas) -> 
     reach = np.linalg.norm(antennas.tx_positions, axis=1).max() / w.range_cell(1)
     own = (d.snr < (np.pi * reach) ** 2 * d.snr[i]) & (np.abs(beat - beat[i]) < 2)
     own[i] = True
-    turn = known.wavenumber * (d.direction - d.direction[i]) @ antennas.rx_positions[:, [0, 2]].T
-    beam = np.abs(np.exp(1j * np.nan_to_num(turn)).mean(axis=1)) ** 2
+    phase = known.wavenumber * (d.direction - d.direction[i]) @ antennas.rx_positions[:, [0, 2]].T
+    beam = np.abs(np.exp(1j * np.nan_to_num(phase)).mean(axis=1)) ** 2
     waves = np.stack([d.snr / d.snr[i] * beam, beat - beat[i], rate - rate[i]], axis=1)[~own]
     snr = float((np.abs(found.channels) ** 2).mean()) / _noise(spectra, known)
     variance = _variances(known, snr, waves)
@@ -181,22 +181,22 @@ def _variances(known: Known, snr: float, waves: np.ndarray) -> np.ndarray:
     slow = np.broadcast_to(slow_window(w), sent.shape).astype(float)
     ramp = 2 * np.pi * w.slope * w.sample_interval * np.arange(w.num_samples)
     ramp -= np.average(ramp, weights=fast)
-    turn = 2 * np.pi * w.effective_carrier * known.times
+    phase = 2 * np.pi * w.effective_carrier * known.times
     each = [sent == antenna for antenna in np.unique(sent)]
     for mine in each:
-        turn[mine] -= np.average(turn[mine], weights=slow[mine])
-    size, curve = slow.sum(), (slow * turn**2).sum()
+        phase[mine] -= np.average(phase[mine], weights=slow[mine])
+    size, curve = slow.sum(), (slow * phase**2).sum()
 
     delay = ((fast * ramp) ** 2).sum() / (fast * ramp**2).sum() ** 2 * (slow**2).sum() / size**2
-    rate = (fast**2).sum() / fast.sum() ** 2 * ((slow * turn) ** 2).sum() / curve**2
+    rate = (fast**2).sum() / fast.sum() ** 2 * ((slow * phase) ** 2).sum() / curve**2
     out = np.array([delay, rate]) / (snr * known.antennas.num_rx)
     rows, step = np.arange(-HALF_WIDTH, HALF_WIDTH + 1), 1e-3
     here = hann_response(w, rows)
     slope = (hann_response(w, rows + step) - hann_response(w, rows - step)) / (2 * step)
     slope /= w.delay_step
     for power, cells, faster in waves:
-        other, wave = hann_response(w, rows - cells), slow * np.exp(1j * turn * faster)
-        late, quick = (sum(abs(x[m].sum()) ** 2 for m in each) for x in (wave, turn * wave))
+        other, wave = hann_response(w, rows - cells), slow * np.exp(1j * phase * faster)
+        late, quick = (sum(abs(x[m].sum()) ** 2 for m in each) for x in (wave, phase * wave))
         delay = (slope @ other / (slope @ slope) / size) ** 2 * late
         out += power * np.array([delay, (here @ other / (here @ here) / curve) ** 2 * quick])
     return out / 2

@@ -27,7 +27,7 @@ STOREY_M = 3.0
 """Height of a storey: that of OpenStreetMap's Simple 3D Buildings."""
 PLATE_M = 0.3
 """Thickness of a roof without walls."""
-MOST_COVERED = 0.5
+REPLACED_SHARE = 0.5
 """Building parts replace an outline of which they cover at least this share; else both stand."""
 _HEIGHTS = ("height", "building:height", "est_height", "measuredHeight", "gesamthoehe")
 """Keys of heights beside the scenario's own: OpenStreetMap's, CityGML's, swissBUILDINGS3D's."""
@@ -266,7 +266,7 @@ def _without_parts(found: list[Outline], parts: list[Outline], notes: list[str])
     covered = Counter[int]()
     for whole, part in zip(outer.tolist(), inside.tolist(), strict=True):
         covered[whole] += area[part]
-    gone = {i for i, of in covered.items() if of >= MOST_COVERED * shapes[i].area}
+    gone = {i for i, of in covered.items() if of >= REPLACED_SHARE * shapes[i].area}
     if gone:
         used = sum(whole in gone for whole in outer.tolist())
         notes.append(f"{len(gone)} buildings drawn by their {used} parts")

@@ -263,8 +263,8 @@ def _triangles(rings: _Rings, vertices: NDArray[np.float64]) -> NDArray[np.int64
     fours = np.array(rings.fours, dtype=np.int64).reshape(-1, 4)
     corners = vertices[fours]
     edges = corners[:, [1, 2, 3, 0]] - corners
-    turns = _cross(edges[:, [3, 0, 1, 2]], edges)
-    convex = ((turns * turns.sum(axis=1, keepdims=True)).sum(axis=2) > 0).all(axis=1)
+    normals = _cross(edges[:, [3, 0, 1, 2]], edges)
+    convex = ((normals * normals.sum(axis=1, keepdims=True)).sum(axis=2) > 0).all(axis=1)
     found = [threes, fours[convex][:, [0, 1, 2]], fours[convex][:, [0, 2, 3]]]
     for boundary in [*rings.others, *([ring] for ring in fours[~convex].tolist())]:
         index = np.array([i for ring in boundary for i in ring], dtype=np.int64)

@@ -84,16 +84,16 @@ def _cap(polygon: shapely.Polygon, plan: NDArray[np.float64]) -> NDArray[np.int6
     """
     pieces = shapely.constrained_delaunay_triangles(polygon)
     corners = shapely.get_coordinates(pieces).reshape(-1, 4, 2)[:, :3]
-    place: dict[tuple[float, ...], int] = {}
+    vertex: dict[tuple[float, ...], int] = {}
     for i, point in enumerate(plan.tolist()):
-        place.setdefault(tuple(point), i)
-    triangles = np.array([[place[tuple(p)] for p in t] for t in corners.tolist()], dtype=np.int64)
-    flipped = _turn(corners) < 0
+        vertex.setdefault(tuple(point), i)
+    triangles = np.array([[vertex[tuple(p)] for p in t] for t in corners.tolist()], dtype=np.int64)
+    flipped = _doubled_area(corners) < 0
     triangles[flipped] = triangles[flipped][:, ::-1]
     return triangles
 
 
-def _turn(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def _doubled_area(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Twice the signed area of plane triangles (T, 3, 2). [m^2]"""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
@@ -118,7 +118,7 @@ def triangulate(rings: Sequence[NDArray[np.float64]]) -> NDArray[np.int64]:
     triangles = np.asarray(
         mapbox_earcut.triangulate_float64(centred, ends), dtype=np.int64
     ).reshape(-1, 3)
-    flipped = _turn(centred[triangles]) < 0
+    flipped = _doubled_area(centred[triangles]) < 0
     triangles[flipped] = triangles[flipped][:, ::-1]
     return triangles
 
@@ -148,7 +148,7 @@ def building(
     rings = [shapely.get_coordinates(r)[:-1] for r in (polygon.exterior, *polygon.interiors)]
     plan = np.concatenate(rings)
     cap = _cap(polygon, plan)
-    covered = _turn(plan[cap]).sum() / 2
+    covered = _doubled_area(plan[cap]).sum() / 2
     if abs(covered - polygon.area) > 1e-6 * polygon.area:
         raise CityError(
             f"{what}: its roof cannot be triangulated ({covered:.6g} of {polygon.area:.6g} m2 "

@@ -29,9 +29,9 @@ from isac_rt.extensions.city_files.terrain import (
 from isac_rt.extensions.city_files.terrain import through_feet as ground_through
 from isac_rt.world import settings
 from isac_rt.world.city.files import JSON_FACTOR, read_bytes, unpacked
+from isac_rt.world.city.georeference import GeoReference, crs_name, georeference_of
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface, check_coordinates
-from isac_rt.world.city.place import Place, crs_name, place_of
 from isac_rt.world.city.prism import Finish
 
 STRAY = 20.0
@@ -98,7 +98,9 @@ def _without_strays(model: CityModel, bad: list[str]) -> CityModel:
     return CityModel(model.crs, kept, model.solids)
 
 
-def _place(city: settings.City, model: CityModel, name: str, notes: list[str]) -> Place:
+def _georeference(
+    city: settings.City, model: CityModel, name: str, notes: list[str]
+) -> GeoReference:
     """Where a city lies, by the scenario, the file, or the size of its numbers."""
     crs = ""
     if city.crs is not None:
@@ -112,22 +114,22 @@ def _place(city: settings.City, model: CityModel, name: str, notes: list[str]) -
         crs = crs_name(model.crs) or ""
         if not crs:
             notes.append(f"coordinate reference system {model.crs[:80]!r} of the file is unknown")
-    return place_of(_boxes(model), crs, city.coordinates, city.origin, name)
+    return georeference_of(_boxes(model), crs, city.coordinates, city.origin, name)
 
 
-def _moved(model: CityModel, place: Place) -> CityModel:
+def _moved(model: CityModel, geo: GeoReference) -> CityModel:
     """The same in world coordinates."""
-    z = place.origin[2]
+    z = geo.origin[2]
     outlines = [
         replace(
-            moved(outline, shapely.transform(outline.shape, place.to_world)),
+            moved(outline, shapely.transform(outline.shape, geo.to_world)),
             foot=None if outline.foot is None else outline.foot - z,
         )
         for outline in model.outlines
     ]
     if not model.solids:
         return CityModel(model.crs, outlines)
-    vertices = place.to_world(np.concatenate([solid.vertices for solid in model.solids]))
+    vertices = geo.to_world(np.concatenate([solid.vertices for solid in model.solids]))
     ends = np.cumsum([len(solid.vertices) for solid in model.solids])[:-1]
     solids = [
         replace(solid, vertices=own)
@@ -137,7 +139,11 @@ def _moved(model: CityModel, place: Place) -> CityModel:
 
 
 def _ground(
-    city: settings.City, model: CityModel, terrain: Path | None, place: Place, notes: list[str]
+    city: settings.City,
+    model: CityModel,
+    terrain: Path | None,
+    geo: GeoReference,
+    notes: list[str],
 ) -> Ground:
     """Return the ground that the city stands on."""
     boxes = _boxes(model)
@@ -149,7 +155,7 @@ def _ground(
     )
     relief = [solid for solid in model.solids if solid.kind == "TINRelief"]
     if terrain is not None:
-        return of_raster(plan, terrain, place, notes)
+        return of_raster(plan, terrain, geo, notes)
     if relief:
         return of_relief(relief)
     _, feet = feet_of(model.solids)
@@ -158,7 +164,7 @@ def _ground(
     if len(feet):
         return ground_through(plan, feet, notes)
     lowest = min((float(solid.vertices[:, 2].min()) for solid in model.solids), default=0.0)
-    return flat(plan, lowest if model.solids else -place.origin[2])
+    return flat(plan, lowest if model.solids else -geo.origin[2])
 
 
 def _standing(model: CityModel) -> list[Outline]:
@@ -224,7 +230,7 @@ def _raised(
 
 def located(
     city: settings.City, path: Path, notes: list[str], bad: list[str]
-) -> tuple[CityModel, Place]:
+) -> tuple[CityModel, GeoReference]:
     """Return what a map's file holds, in its own coordinates, and where it lies.
 
     Raises
@@ -236,12 +242,12 @@ def located(
         raise CityError(
             bad[0] if bad else f"{path.name}: there is no polygon in it; give building footprints"
         )
-    return model, _place(city, model, path.name, notes)
+    return model, _georeference(city, model, path.name, notes)
 
 
 def footprints(
     city: settings.City, path: Path, terrain: Path | None = None
-) -> tuple[list[Surface], list[str], Place]:
+) -> tuple[list[Surface], list[str], GeoReference]:
     """Closed buildings and a ground from a map.
 
     GeoJSON and tables stand on z = 0, or on the terrain. CityJSON keeps its heights, and what
@@ -252,28 +258,28 @@ def footprints(
     surfaces : list of Surface
         World coordinates.
     notes : list of str
-    place : Place
+    geo : Place
 
     Raises
     ------
     CityError
     """
     notes, bad = list[str](), list[str]()
-    model, place = located(city, path, notes, bad)
-    model = _moved(model, place)
-    base = _ground(city, model, terrain, place, notes)
-    if place.crs or any(place.origin):
-        notes.append(place.words())
+    model, geo = located(city, path, notes, bad)
+    model = _moved(model, geo)
+    base = _ground(city, model, terrain, geo, notes)
+    if geo.crs or any(geo.origin):
+        notes.append(geo.words())
     surfaces = _raised(city, model.outlines, base, bad, notes)
     if base.surface is not None:
         surfaces.append(base.surface)
-    return [*_solids(model, base, terrain is not None, notes), *surfaces], notes, place
+    return [*_solids(model, base, terrain is not None, notes), *surfaces], notes, geo
 
 
 def _solids(model: CityModel, base: Ground, replaced: bool, notes: list[str]) -> list[Surface]:
     """Return the parts that have surfaces of their own, down to the ground."""
-    standing = feet_of(model.solids)[0]
-    down = dict(zip(map(id, standing), lowered(standing, base), strict=True))
+    on_ground = feet_of(model.solids)[0]
+    down = dict(zip(map(id, on_ground), lowered(on_ground, base), strict=True))
     surfaces, deep = list[Surface](), list[float]()
     for solid in model.solids:
         if replaced and solid.kind == "TINRelief":

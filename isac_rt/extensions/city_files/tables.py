@@ -107,7 +107,7 @@ def _read_apart(
     size = sum(len(content) for _, content in files)
     seconds = _BASE_S + math.ceil(size * table.factor / _BYTES_PER_S)
     memory = _BASE_BYTES + int(size * table.factor)
-    packages = json.dumps([place for place in sys.path if os.path.isabs(place)])
+    packages = json.dumps([path for path in sys.path if os.path.isabs(path)])
     program = [str(Path(__file__).with_name("table_process.py")), packages]
     # files of the working folder are not this process's, nor are settings for Python
     request = json.dumps({"layer": layer, "files": [(n.lower(), len(c)) for n, c in files]})

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from isac_rt.extensions.city_files.cityjson import BUILDING_TYPES, Solid
 from isac_rt.world.city.files import needs_extra, read_bytes
+from isac_rt.world.city.georeference import GeoReference
 from isac_rt.world.city.materials import CityError, MaterialUse
 from isac_rt.world.city.mesh import Surface
-from isac_rt.world.city.place import Place
 from isac_rt.world.city.prism import ground
 
 FLAT_M = 5.0
@@ -121,7 +121,7 @@ def of_relief(solids: Sequence[Solid]) -> Ground:
     return Ground(None, height)
 
 
-def of_raster(plan: Plan, path: Path, place: Place, notes: list[str]) -> Ground:
+def of_raster(plan: Plan, path: Path, geo: GeoReference, notes: list[str]) -> Ground:
     """Heights from a GeoTIFF, in the coordinates of the world.
 
     Raises
@@ -135,7 +135,7 @@ def of_raster(plan: Plan, path: Path, place: Place, notes: list[str]) -> Ground:
     x = np.linspace(x_0, x_1, max(2, round((x_1 - x_0) / step) + 1))
     y = np.linspace(y_0, y_1, max(2, round((y_1 - y_0) / step) + 1))
     nodes = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    z = _sampled(path, nodes, place, notes) - place.origin[2]
+    z = _sampled(path, nodes, geo, notes) - geo.origin[2]
     grid = z.reshape(len(x), len(y))
 
     def height(at: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -154,7 +154,7 @@ def of_raster(plan: Plan, path: Path, place: Place, notes: list[str]) -> Ground:
 
 
 def _sampled(
-    path: Path, nodes: NDArray[np.float64], place: Place, notes: list[str]
+    path: Path, nodes: NDArray[np.float64], geo: GeoReference, notes: list[str]
 ) -> NDArray[np.float64]:
     """Heights (N,) of a GeoTIFF at world points (N, 2). [m]"""
     rasterio = needs_extra("rasterio", path.name, "GeoTIFF")
@@ -165,7 +165,7 @@ def _sampled(
         raise CityError(f"{path.name}: is no GeoTIFF; give one with heights in its first band")
     try:
         with rasterio.MemoryFile(data) as file, file.open(driver="GTiff") as raster:
-            cells = _cells(raster, nodes, place, path.name, notes)
+            cells = _cells(raster, nodes, geo, path.name, notes)
             window, shape, cells = _window(rasterio, raster, cells, path.name)
             band = raster.read(1, window=window, out_shape=shape, masked=True)
     except CityError:
@@ -183,23 +183,23 @@ def _sampled(
 
 
 def _cells(
-    raster: Any, nodes: NDArray[np.float64], place: Place, name: str, notes: list[str]
+    raster: Any, nodes: NDArray[np.float64], geo: GeoReference, name: str, notes: list[str]
 ) -> NDArray[np.float64]:
     """Rows and columns (N, 2) of a raster at world points."""
     from pyproj import Transformer
 
     if raster.transform.is_identity or raster.transform.is_degenerate:
         raise CityError(f"{name}: says not where it lies; give a GeoTIFF with a geotransform")
-    points = place.to_file(nodes)
-    if place.crs and raster.crs is not None:
-        turned = Transformer.from_crs(place.crs, raster.crs.to_wkt(), always_xy=True)
+    points = geo.to_file(nodes)
+    if geo.crs and raster.crs is not None:
+        turned = Transformer.from_crs(geo.crs, raster.crs.to_wkt(), always_xy=True)
         points = np.column_stack(turned.transform(points[:, 0], points[:, 1]))
         if not np.isfinite(points).all():
             raise CityError(f"{name}: lies elsewhere than the buildings; check city.crs")
-    elif place.crs or raster.crs is not None:
+    elif geo.crs or raster.crs is not None:
         notes.append(f"{name}: taken to lie in the coordinates of the buildings")
-    turn = ~raster.transform
-    column, row = np.array([[turn.a, turn.b], [turn.d, turn.e]]) @ points.T + [[turn.c], [turn.f]]
+    to_pixel = ~raster.transform
+    column, row = np.reshape(to_pixel, (3, 3))[:2] @ np.vstack([points.T, np.ones(len(points))])
     return np.column_stack([row, column]) - 0.5
 
 
@@ -226,22 +226,22 @@ def _window(
         )
     shape = np.minimum(high - low, 2048)
     window = rasterio.windows.Window(low[1], low[0], *(high - low)[::-1])
-    places = (cells - low + 0.5) * shape / (high - low) - 0.5
-    return window, (int(shape[0]), int(shape[1])), places
+    pixels = (cells - low + 0.5) * shape / (high - low) - 0.5
+    return window, (int(shape[0]), int(shape[1])), pixels
 
 
 def feet_of(solids: Sequence[Solid]) -> tuple[list[Solid], NDArray[np.float64]]:
-    """The bodies that stand on the ground and where: the middle of the feet of each (N, 3)."""
+    """Return the solids on the ground, and the middle of the feet of each (N, 3)."""
     roots: dict[str, list[Solid]] = {}
     for solid in solids:
         if solid.kind in BUILDING_TYPES and solid.foot.size:
             roots.setdefault(solid.root, []).append(solid)
-    standing = [solid for parts in roots.values() for solid in parts if not _rests_on(solid, parts)]
+    grounded = [solid for parts in roots.values() for solid in parts if not _rests_on(solid, parts)]
     points = [
         np.append(b.vertices[b.foot, :2].mean(axis=0), np.median(b.vertices[b.foot, 2]))
-        for b in standing
+        for b in grounded
     ]
-    return standing, np.array(points).reshape(-1, 3)
+    return grounded, np.array(points).reshape(-1, 3)
 
 
 def _rests_on(solid: Solid, parts: Sequence[Solid]) -> bool:
@@ -275,7 +275,7 @@ def lowered(solids: Sequence[Solid], base: Ground) -> list[tuple[Solid, float]]:
 
 
 def _lowered(solid: Solid, down: NDArray[np.float64]) -> tuple[Solid, float]:
-    """A body whose feet went down by so much [m], where that is down."""
+    """Return a solid lowered by a height [m], if positive."""
     if not (down > 0).any():
         return solid, 0.0
     vertices = solid.vertices.copy()

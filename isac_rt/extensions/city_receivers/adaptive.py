@@ -46,7 +46,7 @@ def scanned(search: Search) -> tuple[tuple[float, float], float]:
 
     The correlation length along an axis is 1 / (k s), s the deviation of the channels' places.
     """
-    covariance = search.wavenumber**2 * np.cov(search.channels.places[:, [0, 2]].T, bias=True)
+    covariance = search.wavenumber**2 * np.cov(search.channels.positions[:, [0, 2]].T, bias=True)
     width = search.steps * [u.size for u in search.cosines]
     x, z = width * np.sqrt(np.diag(covariance))
     return (float(x), float(z)), float(width.prod() * np.sqrt(max(np.linalg.det(covariance), 0.0)))

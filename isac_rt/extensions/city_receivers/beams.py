@@ -58,10 +58,10 @@ def beam_weights(
     w_k ~ (sum_j g_j a_j a_j^H + loading I)^-1 a_k over the paths that share k's cells; alone this
     is the plain beam.
     """
-    turn = 2j * np.pi * waveform.effective_carrier
+    j_omega = 2j * np.pi * waveform.effective_carrier
     steer = np.exp(
         [
-            turn * element_delays(antennas.rx_positions, u, max(r, waveform.range_cell(1)))[0]
+            j_omega * element_delays(antennas.rx_positions, u, max(r, waveform.range_cell(1)))[0]
             for u, r in zip(prediction.direction, prediction.range, strict=True)
         ]
     )
@@ -162,11 +162,11 @@ def _beam_spectra(
     for m in range(shape[0]):
         beams = np.tensordot(weights, cube.samples[m], axes=1)
         for k, beat in enumerate(beats):
-            turn = tones(-beat[m] / w.num_samples, w.num_samples)
-            transform(beams[k : k + 1], turn, cells, made)
+            derotation = tones(-beat[m] / w.num_samples, w.num_samples)
+            transform(beams[k : k + 1], derotation, cells, made)
             out[k, m] = made[0].T
             if run_cells is not None:
-                runs = chirp_runs(cube.samples[m], turn, run_cells)
+                runs = chirp_runs(cube.samples[m], derotation, run_cells)
                 out[k, m][runs[:, cells % w.num_samples]] = 0
     return out
 

@@ -50,12 +50,12 @@ from isac_rt.receive.estimate import (
 )
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import UNION_FLOOR
-from isac_rt.receive.pursuit import LEFT_OVER_DB, BySchedule, take_strong
+from isac_rt.receive.pursuit import RESIDUAL_DB, BySchedule, take_strong
 from isac_rt.receive.sense import Sensed, describe
 from isac_rt.receive.types import NO_HINTS, Detections, ExpectedClutter, Hints
 
 BESIDE = (3, 1)
-"""Rows and bins about a path that was taken out which may hold its remainder, `LEFT_OVER_DB` below
+"""Rows and bins about a path that was taken out which may hold its remainder, `RESIDUAL_DB` below
 it."""
 STD_CELLS = 0.1
 """Smallest deviation of range and velocity, in cells, of what shares its cell with others."""
@@ -168,15 +168,15 @@ class Remainder:
     def of(
         cls, strong: list[Estimate], snr: np.ndarray, known: Known, shape: tuple[int, ...]
     ) -> Remainder:
-        """`LEFT_OVER_DB` below each strong path, in the cells `BESIDE` it."""
+        """`RESIDUAL_DB` below each strong path, in the cells `BESIDE` it."""
         w, power, owner = known.waveform, np.zeros(shape, np.float32), np.zeros(shape, np.int64)
         for k, (e, over) in enumerate(zip(strong, snr, strict=True)):
             row = round(float(w.beat_cells(e.delay, e.delay_rate, 0.0)))
             column = round(e.delay_rate * w.frame_duration * w.effective_carrier) + shape[1] // 2
             rows = np.arange(max(row - BESIDE[0], 0), min(row + BESIDE[0] + 1, shape[0]))
             block = np.ix_(rows, (np.arange(-BESIDE[1], BESIDE[1] + 1) + column) % shape[1])
-            more = over * 10 ** (-LEFT_OVER_DB / 10) > power[block]
-            power[block] = np.where(more, over * 10 ** (-LEFT_OVER_DB / 10), power[block])
+            more = over * 10 ** (-RESIDUAL_DB / 10) > power[block]
+            power[block] = np.where(more, over * 10 ** (-RESIDUAL_DB / 10), power[block])
             owner[block] = np.where(more, k, owner[block])
         size = known.antennas.num_tx, known.antennas.num_rx
         return cls(power, owner, np.array([e.channels for e in strong]).reshape(-1, *size))

@@ -40,7 +40,7 @@ PEAKS = 8
 """Cells kept of every chirp. The strongest by power is the path's down to some 3 dB per cell and
 antenna; by beam one of four still is some 3 dB under that, and one of eight in all chirps of a
 frame."""
-APART = 3
+MIN_SPACING = 3
 """Half cells on each side of a cell that is kept in which no further one is."""
 FASTEST = 45.0
 """Rate of a path's length within which it is sought [m/s]."""
@@ -146,7 +146,10 @@ def find_peaks(cube: IFCube, time: float, modulated: bool) -> Peaks:
     halves = [np.exp(-1j * np.pi * h * fast / size) for h in (0, 1)]
     factors = [np.broadcast_to(h.astype(np.complex64), (chirps, size)) for h in halves]
     spectra = new_memory((2, num_rx, size, chirps))
-    cells, places = np.empty((groups, chirps, PEAKS)), np.empty((groups, chirps, PEAKS), np.int64)
+    cells, half_cells = (
+        np.empty((groups, chirps, PEAKS)),
+        np.empty((groups, chirps, PEAKS), np.int64),
+    )
     values = np.empty((groups, chirps, PEAKS, num_rx), np.complex64)
     noise = np.empty(groups)
     every = np.arange(chirps)
@@ -159,20 +162,20 @@ def find_peaks(cube: IFCube, time: float, modulated: bool) -> Peaks:
         left = dense.copy()
         for k in range(PEAKS):
             at = left.argmax(axis=1)
-            near = (at[:, None] + np.arange(-APART, APART + 1)) % (2 * size)
+            near = (at[:, None] + np.arange(-MIN_SPACING, MIN_SPACING + 1)) % (2 * size)
             left[every[:, None], near] = 0.0
             around = [dense[every, (at + i) % (2 * size)].astype(float) for i in (-1, 0, 1)]
             cells[m, :, k] = at / 2 + _offset(*around)
-            places[m, :, k] = at
+            half_cells[m, :, k] = at
             values[m, :, k] = spectra[at % 2, :, at // 2, every]
-    turn = np.exp(1j * np.pi * places / 2 * ((size - 1) / size))
+    phasor = np.exp(1j * np.pi * half_cells / 2 * ((size - 1) / size))
     return Peaks(
         time,
         modulated,
         w,
         cube.schedule,
         cells.astype(np.float32),
-        (values * turn[..., None]).astype(np.complex64),
+        (values * phasor[..., None]).astype(np.complex64),
         float(noise.mean()),
     )
 
@@ -244,8 +247,8 @@ def read_peaks(
         return None
     raw = np.clip(raw, 0, w.num_delay_symbols - 1)
     # from the middle of the samples back to where the reader counts phases from
-    turn = np.exp(-1j * np.pi * (beats + raw) * ((w.num_samples - 1) / w.num_samples))
-    picked = of(beams) * turn * np.exp(-2j * np.pi * known_cycles(w, delay, rate, raw))
+    phasors = np.exp(-1j * np.pi * (beats + raw) * ((w.num_samples - 1) / w.num_samples))
+    picked = of(beams) * phasors * np.exp(-2j * np.pi * known_cycles(w, delay, rate, raw))
     product, length = transitions_of(picked[None], peaks.schedule, w, raw)
     far = (4 * prediction.velocity_std[0] + w.velocity_cell(1)) / SPEED_OF_LIGHT
     found = rate_error(product[0], length, far, order, w)

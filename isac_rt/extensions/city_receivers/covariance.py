@@ -64,7 +64,7 @@ class Bucketed:
             doppler[received],
             row[received],
         )
-        steer = turned(-known.wavenumber * (clutter.arrival @ search.channels.places.T))
+        steer = turned(-known.wavenumber * (clutter.arrival @ search.channels.positions.T))
         power = (clutter.power / noise).astype(np.float32)
         if len(leaks) > 1:  # the same scatterers once more for each image
             sent = steer.reshape(-1, known.antennas.num_tx, known.antennas.num_rx)

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import ndimage
 
 from isac_rt.extensions.city_receivers.power import cells_of
-from isac_rt.frame.antennas import SAME_PLACE_M, Antennas
+from isac_rt.frame.antennas import SAME_POSITION_M, Antennas
 from isac_rt.receive.known import Known
 from isac_rt.receive.types import ExpectedClutter, Neighbours
 
@@ -36,11 +36,11 @@ LEAST_BLOCKS = 5
 @lru_cache(maxsize=16)
 def neighbours_of(antennas: Antennas) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Virtual channels next to each other along X and along Z: first, second and axis (Q,)."""
-    places = np.round(antennas.virtual_positions[:, [0, 2]] / SAME_PLACE_M).astype(int)
-    apart = places[None] - places[:, None]
+    positions = np.round(antennas.virtual_positions[:, [0, 2]] / SAME_POSITION_M).astype(int)
+    offset = positions[None] - positions[:, None]
     out = []
     for axis in (0, 1):
-        along = np.where(apart[..., 1 - axis] == 0, apart[..., axis], 0)
+        along = np.where(offset[..., 1 - axis] == 0, offset[..., axis], 0)
         if not along.any():
             continue
         nearest = along[along > 0].min()
@@ -51,15 +51,15 @@ def neighbours_of(antennas: Antennas) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def coherence(
-    clutter: ExpectedClutter, known: Known, axis: int, apart: float, shape: tuple[int, int]
+    clutter: ExpectedClutter, known: Known, axis: int, spacing: float, shape: tuple[int, int]
 ) -> np.ndarray:
-    """Gamma (rows, P), FFT order, of channels `apart` [m] along X (0) or Z (1), but for a
+    """Gamma (rows, P), FFT order, of channels `spacing` [m] along X (0) or Z (1), but for a
     factor."""
     beat, doppler = cells_of(clutter, known.waveform)
     row = np.round(beat).astype(int)
     inside = (row >= 0) & (row < shape[0])
     at = (row * shape[1] + np.round(doppler).astype(int) % shape[1])[inside]
-    wave = np.exp(-1j * known.wavenumber * apart * clutter.arrival[inside, 2 * axis])
+    wave = np.exp(-1j * known.wavenumber * spacing * clutter.arrival[inside, 2 * axis])
     weight = clutter.power[inside] * wave
     grid = np.bincount(at, weight.real, shape[0] * shape[1]) + 1j * np.bincount(
         at, weight.imag, shape[0] * shape[1]
@@ -89,15 +89,15 @@ def phases(
     power = (np.abs(channels) ** 2).mean(axis=0)
     usable = (mean > 1.05 * noise) & (power < OUTLIER * mean)
     first, second, axis = neighbours_of(known.antennas)
-    places = known.antennas.virtual_positions[:, [0, 2]]
+    positions = known.antennas.virtual_positions[:, [0, 2]]
     sums = np.zeros((BLOCKS, first.size), complex)
     rows, columns = np.nonzero(usable)
     block = rows * BLOCKS // shape[0]
     received = channels[:, rows, columns]
     for one in np.unique(axis):
         pairs = np.flatnonzero(axis == one)
-        apart = float(places[second[pairs[0]], one] - places[first[pairs[0]], one])
-        gamma = coherence(clutter, known, int(one), apart, shape)[rows, columns]
+        spacing = float(positions[second[pairs[0]], one] - positions[first[pairs[0]], one])
+        gamma = coherence(clutter, known, int(one), spacing, shape)[rows, columns]
         weight = gamma.conj() / mean[rows, columns] ** 2
         for q in pairs:
             product = received[first[q]].conj() * received[second[q]] * weight

@@ -38,7 +38,7 @@ STD_CELLS = 0.02
 """Floor of its range and velocity deviations in cells."""
 NAMED_CELLS = 1.5
 """Cells of length and of its rate within which a path is one that the city explains."""
-FIRST_BEND = 3.0
+FIRST_ACCELERATION_STD = 3.0
 """Deviation of the acceleration of a path that is seen for the first time [m/s^2]."""
 
 
@@ -120,8 +120,8 @@ class OutOfSequence(OtherPaths):
         length = path.mean[:2] - SPEED_OF_LIGHT * own.clock
         straight = measure(there, own.pose)[None, :2]
         over_walls = sender_images(there[:6], own.pose, self._walls, float(length[0]) + 1)
-        apart = np.abs(np.concatenate([straight, over_walls[:, :2]]) - length)
-        return bool((apart < NAMED_CELLS * self._cells).all(axis=1).any())
+        difference = np.abs(np.concatenate([straight, over_walls[:, :2]]) - length)
+        return bool((difference < NAMED_CELLS * self._cells).all(axis=1).any())
 
     def _is_well_inside(self, reception: Reception) -> bool:
         """Return whether the reference is not so near the edge of the view that it may have come
@@ -157,7 +157,7 @@ class OutOfSequence(OtherPaths):
     def take_over(self, reference: Prediction, own: Own) -> None:
         p = delayed(reference, own.clock)
         mean = np.array([p.range[0], p.velocity[0], 0.0])
-        spread = np.square([p.range_std[0], p.velocity_std[0], FIRST_BEND])
+        spread = np.square([p.range_std[0], p.velocity_std[0], FIRST_ACCELERATION_STD])
         self.state.path = DataPath(own.time, mean, np.diag(spread), p.direction[0])
 
     def start(self, detections: Detections, time: float) -> None:
@@ -171,7 +171,7 @@ class OutOfSequence(OtherPaths):
         if len(d):
             i = int(d.snr.argmax())
             mean = np.array([d.range[i], d.velocity[i], 0.0])
-            spread = np.append(self._deviations(d, i), FIRST_BEND) ** 2
+            spread = np.append(self._deviations(d, i), FIRST_ACCELERATION_STD) ** 2
             self.state.path = DataPath(time, mean, np.diag(spread), d.direction[i])
 
     def forget(self) -> None:

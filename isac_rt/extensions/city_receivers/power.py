@@ -111,16 +111,16 @@ class Response:
         `slope` (K, A), Doppler centred."""
         weigh, along = _kernels(self.waveform, self.taper, self.rows)
         size, half = self.waveform.num_chirps, self.waveform.num_chirps // 2 + 1
-        turn = 2j * np.pi * np.arange(along.size) / size
-        inside, places, shares = self._places(beat, doppler)
+        ramp = 2j * np.pi * np.arange(along.size) / size
+        inside, grid_points, shares = self._grid_points(beat, doppler)
         grid_shape = weigh.shape[1], size * FINE_DOPPLER
         out = np.empty((1 + slope.shape[1], self.rows, size))
         for number, made in enumerate(out):
             weight = (power if number == 0 else power * slope[:, number - 1])[inside]
             weights = np.concatenate([weight * share for share in shares])
-            grid = np.bincount(places, weights, grid_shape[0] * grid_shape[1])
+            grid = np.bincount(grid_points, weights, grid_shape[0] * grid_shape[1])
             spectra = scipy.fft.rfft(weigh @ grid.reshape(grid_shape))
-            spectra *= along if number == 0 else -along * turn
+            spectra *= along if number == 0 else -along * ramp
             # every third place alone is wanted: the three parts of the spectrum fall together
             folded = spectra[:, :half] + spectra[:, size : size + half]
             folded += spectra[:, size : size - half : -1].conj()
@@ -132,7 +132,7 @@ class Response:
         steps = size // shares.size * np.arange(shares.size)
         return sum(q * np.roll(shown, step, axis=2) for q, step in zip(shares, steps, strict=True))
 
-    def _places(
+    def _grid_points(
         self, beat: np.ndarray, doppler: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Place scatterers on the fine grid: which lie on it, the two places of each, on the
@@ -143,8 +143,8 @@ class Response:
         at = doppler[inside] * FINE_DOPPLER
         left = np.floor(at).astype(np.int64)
         first, share = line[inside] * size, at - left
-        places = np.concatenate([first + left % size, first + (left + 1) % size])
-        return inside, places, (1 - share, share)
+        grid_points = np.concatenate([first + left % size, first + (left + 1) % size])
+        return inside, grid_points, (1 - share, share)
 
 
 def expected_power(

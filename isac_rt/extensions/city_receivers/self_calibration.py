@@ -54,7 +54,7 @@ CELLS = 0.02
 ROUNDS = 5
 LEAST_SNR = 1.0
 """Of a channel, under which a measured path says nothing."""
-FLOOR = 1e-4
+LEAST_NOISE = 1e-4
 """Least noise of a channel over its power: what plane waves and seven range rows leave out."""
 LEAST_PHASE, MESH_PHASE = 0.01, 0.05
 """Of neighbouring channels as clutter shows them [rad]: the least deviation that is believed, and
@@ -241,7 +241,7 @@ class SelfCalibration(HardwareModel):
         left_out = self._elements @ (gains[0] + 1j * gains[1])
         modes = measured.modes.reshape(MODES, -1) * np.exp(-left_out) * towards.conj()
         power = float(np.mean(np.abs(modes[0]) ** 2))
-        noise = max(self._noise(modes[0], measured.snr), FLOOR * power)
+        noise = max(self._noise(modes[0], measured.snr), LEAST_NOISE * power)
         if noise * LEAST_SNR >= power:
             return
         fitted = self._fit(modes[0], noise, across, known_direction.direction_std)
@@ -258,7 +258,7 @@ class SelfCalibration(HardwareModel):
     def _steering(self, known_direction: KnownDirection) -> tuple[np.ndarray, np.ndarray]:
         """Response (C,) of the channels to a wave, and its phase's derivative (C, 2) with respect
         to u_x and u_z."""
-        turn = 2 * np.pi * self.waveform.effective_carrier
+        omega = 2 * np.pi * self.waveform.effective_carrier
         a = self._antennas
         rx, d_rx = element_delays(a.rx_positions, known_direction.direction, known_direction.radius)
         tx, d_tx = np.zeros(a.num_tx), np.zeros((2, a.num_tx))
@@ -266,8 +266,8 @@ class SelfCalibration(HardwareModel):
             tx, d_tx = element_delays(
                 a.tx_positions, known_direction.direction, known_direction.radius
             )
-        phase = turn * (tx[:, None] + rx).ravel()
-        across = turn * (d_tx[:, :, None] + d_rx[:, None]).reshape(2, -1)
+        phase = omega * (tx[:, None] + rx).ravel()
+        across = omega * (d_tx[:, :, None] + d_rx[:, None]).reshape(2, -1)
         return np.exp(1j * phase), across.T
 
     def _noise(self, received: np.ndarray, snr: float) -> float:

@@ -33,7 +33,7 @@ from isac_rt.receive.estimate import Estimate
 
 MOST_WAVES = 3
 """Waves that are told apart in a cell; each further one costs a search."""
-LEFT_OVER = 3e-3
+RESIDUAL_SHARE = 3e-3
 """Share of a wave's statistic that its removal may leave, for what straddles the cell."""
 RESOLVED = 0.5
 """Share of a direction's response that the known waves must leave of it."""
@@ -92,7 +92,7 @@ def waves_of(
     ratio : its statistic over the threshold, which further waves have to exceed, too
     """
     u, alone = first[None], float(_statistic(x, inverse, first, search))
-    least = alone * max(1 / ratio, LEFT_OVER)
+    least = alone * max(1 / ratio, RESIDUAL_SHARE)
     while len(u) < MOST_WAVES:
         peak, further = _further(x, inverse, u, search)
         if peak < least:

@@ -29,7 +29,7 @@ stand 32 dB and more; second harmonics of the mixer, which have rank one too, re
 REACH = 6
 """Range cells on each side of the echo that belong to it, and about zero that belong to the
 leakage."""
-MOST_LEFT_DB = -6.0
+MAX_RESIDUAL_DB = -6.0
 """What one tone per channel leaves of a reflector at most. Measured boards leave -11.5 dB and less;
 of two reflectors in neighbouring cells, or of a spectrum that is cut, most is left."""
 PADDING = 5
@@ -189,7 +189,7 @@ def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Ca
     )
 
 
-def _places(size: int) -> np.ndarray:
+def _centred_index(size: int) -> np.ndarray:
     """Samples from the middle of the chirp."""
     return np.arange(size) - (size - 1) / 2
 
@@ -204,8 +204,8 @@ def _centred(values: np.ndarray) -> np.ndarray:
 
 def _levelled(gain: np.ndarray) -> np.ndarray:
     """Normalise to a mean level of 0 dB and a mean phase of about 0."""
-    turn = gain.sum() / abs(gain.sum())
-    return np.asarray(gain / turn / np.exp(np.log(np.abs(gain)).mean()))
+    phasor = gain.sum() / abs(gain.sum())
+    return np.asarray(gain / phasor / np.exp(np.log(np.abs(gain)).mean()))
 
 
 def _reflector(y: np.ndarray, w: Waveform, one_sided: bool) -> tuple[float, float]:
@@ -245,7 +245,7 @@ def _refuse_faint(amplitude: np.ndarray) -> None:
     if faint.any():
         r, t = np.argwhere(faint)[0]
         raise CaptureError(
-            f"receiver {r} hears the reflector by transmitter {t} more than {FAINT_DB:g} dB below "
+            f"receiver {r} receives the reflector from TX {t} more than {FAINT_DB:g} dB below "
             f"the mean of all, and so do {faint.sum()} of {faint.size} channels; see whether these "
             "antennas are connected"
         )
@@ -253,11 +253,11 @@ def _refuse_faint(amplitude: np.ndarray) -> None:
 
 def _refuse_two(share: float, left_db: float, metres: float) -> None:
     """Raise a `CaptureError` if the echo that was fitted is not that of one reflector."""
-    if share < LEAST_SHARE or left_db > MOST_LEFT_DB:
+    if share < LEAST_SHARE or left_db > MAX_RESIDUAL_DB:
         raise CaptureError(
             f"no clear reflector: what stands at {metres:.2f} m has a rank-one share of "
             f"{share:.3f} (at least {LEAST_SHARE:g}), and one tone leaves {left_db:.1f} dB of it "
-            f"(at most {MOST_LEFT_DB:g}); keep other things out of the reflector's range cells, "
+            f"(at most {MAX_RESIDUAL_DB:g}); keep other things out of the reflector's range cells, "
             "and see whether the file holds whole spectra"
         )
 
@@ -265,15 +265,15 @@ def _refuse_two(share: float, left_db: float, metres: float) -> None:
 def _peaks(y: np.ndarray, cell: float) -> np.ndarray:
     """Maximum-likelihood beat of every channel [range cells] within two cells, under the window."""
     size = y.shape[-1]
-    place = _places(size)
-    still = y * ti_window(size) * np.exp(-2j * np.pi * cell / size * place)
+    index = _centred_index(size)
+    still = y * ti_window(size) * np.exp(-2j * np.pi * cell / size * index)
     offset = np.linspace(-2, 2, 41)
-    spectra = still @ np.exp(-2j * np.pi / size * np.outer(place, offset))
+    spectra = still @ np.exp(-2j * np.pi / size * np.outer(index, offset))
     found = offset[np.abs(spectra).argmax(axis=-1)]
-    turn = -2j * np.pi / size * place
+    exponent = -2j * np.pi / size * index
     for _ in range(ROUNDS):  # Newton on the periodogram
-        e = still * np.exp(found[..., None] * turn)
-        s, d, dd = e.sum(axis=-1), e @ turn, e @ turn**2
+        e = still * np.exp(found[..., None] * exponent)
+        s, d, dd = e.sum(axis=-1), e @ exponent, e @ exponent**2
         bend = np.abs(d) ** 2 + (s.conj() * dd).real
         step = (s.conj() * d).real / np.where(bend < 0, bend, -(np.abs(d) ** 2) - 1e-300)
         found = found - np.clip(step, -0.1, 0.1)
@@ -284,8 +284,9 @@ def _amplitudes(y: np.ndarray, cells: float | np.ndarray) -> np.ndarray:
     """Complex amplitudes at the middle of the chirp, of a tone at `cells`, under the window."""
     size = y.shape[-1]
     window = ti_window(size) / ti_window(size).sum()
-    turn = np.exp(-2j * np.pi / size * np.multiply.outer(np.asarray(cells), _places(size)))
-    return np.asarray((y * (window * turn)).sum(axis=-1))
+    index = _centred_index(size)
+    phasors = np.exp(-2j * np.pi / size * np.multiply.outer(np.asarray(cells), index))
+    return np.asarray((y * (window * phasors)).sum(axis=-1))
 
 
 def _rank_one(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -312,8 +313,8 @@ def _late(
     target = distance * np.array([cosines[0], forward, cosines[1]])
     if capture.antennas is None:
         return np.zeros(capture.cube.samples.shape[1]), np.zeros(capture.cube.waveform.num_tx)
-    places = capture.antennas.rx_positions, capture.antennas.tx_positions
-    rx, tx = ((np.linalg.norm(target - at, axis=1) - distance) / SPEED_OF_LIGHT for at in places)
+    positions = capture.antennas.rx_positions, capture.antennas.tx_positions
+    rx, tx = ((np.linalg.norm(target - at, axis=1) - distance) / SPEED_OF_LIGHT for at in positions)
     return rx, tx
 
 
@@ -324,7 +325,7 @@ def _bound(y: np.ndarray, amplitude: np.ndarray) -> float:
     window = ti_window(size)
     power = (np.abs(np.fft.fft(y * window, axis=-1)) ** 2).mean(axis=(0, 1)) / (window**2).sum()
     noise = np.sort(power)[: size // 4].mean()
-    information = 2 * (2 * np.pi / size) ** 2 * (_places(size) ** 2).sum() / noise
+    information = 2 * (2 * np.pi / size) ** 2 * (_centred_index(size) ** 2).sum() / noise
     return float(np.sqrt((1 / (information * np.abs(amplitude) ** 2)).mean()))
 
 
@@ -345,18 +346,18 @@ def _unexplained(y: np.ndarray, cells: np.ndarray, respond: bool) -> _Fit:
     Marquardt: to first order an imaginary slope is a common shift of the beats.
     """
     size = y.shape[-1]
-    place, window = _places(size), ti_window(size)
-    x, turn = place / (size / 2), 2j * np.pi / size * place
+    index, window = _centred_index(size), ti_window(size)
+    x, exponent = index / (size / 2), 2j * np.pi / size * index
     offset = np.arange(-REACH * PADDING, REACH * PADDING + 1) / PADDING
-    atoms = np.exp(-np.multiply.outer(turn, offset))
+    atoms = np.exp(-np.multiply.outer(exponent, offset))
     beat = cells.ravel()
     begin = np.round(beat * PADDING) / PADDING
-    seen = (y.reshape(-1, size) * window * np.exp(-np.multiply.outer(begin, turn))) @ atoms
+    seen = (y.reshape(-1, size) * window * np.exp(-np.multiply.outer(begin, exponent))) @ atoms
     best, least, damping = (beat, 0j, seen[:, :1]), np.inf, 1e-3
     slope = 0j
     for _ in range(ROUNDS):
-        tones = window * np.exp(np.multiply.outer(beat - begin, turn))
-        plain, bent, moved = (tones * f @ atoms for f in (1.0, x, turn * (1 + slope * x)))
+        tones = window * np.exp(np.multiply.outer(beat - begin, exponent))
+        plain, bent, moved = (tones * f @ atoms for f in (1.0, x, exponent * (1 + slope * x)))
         model = plain + slope * bent
         amplitude = _projection(model, seen)
         rest = seen - amplitude * model
@@ -412,8 +413,8 @@ def near_spectra(capture: Capture, cell: float) -> np.ndarray:
     y = capture.channels()
     size = y.shape[-1]
     offset = np.round(cell * PADDING) + np.arange(-REACH * PADDING, REACH * PADDING + 1)
-    turns = np.multiply.outer(_places(size), offset / PADDING / size)
-    return np.asarray((y * ti_window(size)) @ np.exp(-2j * np.pi * turns))
+    cycles = np.multiply.outer(_centred_index(size), offset / PADDING / size)
+    return np.asarray((y * ti_window(size)) @ np.exp(-2j * np.pi * cycles))
 
 
 def _projection(on: np.ndarray, of: np.ndarray) -> np.ndarray:
@@ -428,16 +429,16 @@ def _sweep(y: np.ndarray, cells: np.ndarray, w: Waveform) -> np.ndarray:
     where it is more than a tenth.
     """
     size = y.shape[-1]
-    place, window = _places(size), ti_window(size)
-    turn = np.exp(-2j * np.pi / size * np.multiply.outer(cells, place))
-    spectra = np.fft.fft(y * window * turn, axis=-1)
+    index, window = _centred_index(size), ti_window(size)
+    phasors = np.exp(-2j * np.pi / size * np.multiply.outer(cells, index))
+    spectra = np.fft.fft(y * window * phasors, axis=-1)
     spectra[..., REACH + 1 : size - REACH] = 0
     response = np.fft.ifft(spectra, axis=-1) / window / _amplitudes(y, cells)[..., None]
     at = np.round((0.5 + 0.4 * np.linspace(-1, 1, SWEEP_POINTS)) * (size - 1)).astype(int)
     flat = response.reshape(-1, size)
     mean = flat.mean(axis=0)
     middle = mean[(size - 1) // 2]
-    frequency = w.effective_carrier + place[at] * w.slope / w.sampling_rate
+    frequency = w.effective_carrier + index[at] * w.slope / w.sampling_rate
     spread = flat[:, at].std(axis=0) / np.sqrt(len(flat)) / abs(middle)
     return np.stack([frequency, mean[at] / middle, spread])
 
@@ -486,7 +487,7 @@ def board(calibration: Calibration, cube: IFCube, parts: Sequence[str]) -> np.nd
     """
     w, senders, one = cube.waveform, cube.schedule, calibration
     one.check_size(cube.samples.shape[1], w.num_tx)
-    sweep = _places(w.num_samples) * w.slope / w.sampling_rate
+    sweep = _centred_index(w.num_samples) * w.slope / w.sampling_rate
     off = w.effective_carrier - one.carrier_hz + sweep
     gain = np.ones((one.rx_gain.size, one.tx_gain.size), complex)
     delay = np.zeros(gain.shape)
@@ -500,9 +501,9 @@ def board(calibration: Calibration, cube: IFCube, parts: Sequence[str]) -> np.nd
     level, late = by_chirp  # (M, L_rx, P, 1)
     out = level * np.exp(2j * np.pi * late * off)
     if "response" in parts:
-        turn = np.exp(2j * np.pi * one.response_delay * off)
-        place = np.clip(off / one.half_sweep_hz, -1, 1)  # beyond what was swept it is held
-        out = out * turn * (1 + one.response_slope * place)
+        phasor = np.exp(2j * np.pi * one.response_delay * off)
+        relative = np.clip(off / one.half_sweep_hz, -1, 1)  # beyond what was swept it is held
+        out = out * phasor * (1 + one.response_slope * relative)
     return np.asarray(out)
 
 

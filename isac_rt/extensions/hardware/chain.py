@@ -14,7 +14,7 @@ MAX_DRIVE = np.float32(1e15)
 """Power over the saturation's whose square float32 still holds."""
 
 
-def places_of(record: Record, begin: np.ndarray, sign: float) -> tuple[np.ndarray, np.ndarray]:
+def weights_at(record: Record, begin: np.ndarray, sign: float) -> tuple[np.ndarray, np.ndarray]:
     """Find where rows of samples that begin at times (R,) [s] lie in an oscillator's phase.
 
     Returns
@@ -22,9 +22,9 @@ def places_of(record: Record, begin: np.ndarray, sign: float) -> tuple[np.ndarra
     first : (R,) the value before the first sample
     weight : (R, 4) of the cubic through those around it, in cycles, with the sign
     """
-    place = (begin - record.start) / record.step
-    first = np.floor(place).astype(np.int64)
-    return first, cubic(place - first) * (sign / (2 * np.pi))
+    index = (begin - record.start) / record.step
+    first = np.floor(index).astype(np.int64)
+    return first, cubic(index - first) * (sign / (2 * np.pi))
 
 
 def add_phase(
@@ -46,7 +46,7 @@ def add_phases(out: np.ndarray, record: Record, begin: np.ndarray, sign: float) 
     begin : (R,) time of the first sample of each row [s]; the others follow at the IF's rate
     sign : 1 or -1
     """
-    add_phase(out, record.values, *places_of(record, begin, sign))
+    add_phase(out, record.values, *weights_at(record, begin, sign))
 
 
 def phasors(cycles: np.ndarray) -> np.ndarray:
@@ -55,7 +55,7 @@ def phasors(cycles: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Turns:
+class CommonFactor:
     """The complex factor of each chirp's samples that all receive elements share; None: nothing of
     the kind.
 
@@ -64,7 +64,7 @@ class Turns:
     oscillators : phase values [rad], and of each chirp the value before its first sample (R,) and
         the weights of the cubic (R, 4), divided by 2 pi, with the sign
     always : (N,) the same in all chirps [cycles]
-    place, beat : (N,) places of the samples, (R,) cycles per sample by which they turn
+    sample_index, beat : (N,) places of the samples, (R,) cycles per sample by which they turn
     sent : (A, W) complex64 gains of each transmit antenna
     antenna, begin : (R,) which of them, and where in it, each chirp begins
     gain : (N,) complex64, gain of all chirps
@@ -72,14 +72,14 @@ class Turns:
 
     oscillators: tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...] = ()
     always: np.ndarray | None = None
-    place: np.ndarray | None = None
+    sample_index: np.ndarray | None = None
     beat: np.ndarray | None = None
     sent: np.ndarray | None = None
     antenna: np.ndarray | None = None
     begin: np.ndarray | None = None
     gain: np.ndarray | None = None
 
-    def of_rows(self, every: int) -> Turns:
+    def of_rows(self, every: int) -> CommonFactor:
         """Return the rows of one chirp in `every`."""
         rows = {name: getattr(self, name) for name in ("beat", "antenna", "begin")}
         return replace(
@@ -94,7 +94,7 @@ class Turns:
         for values, first, weight in self.oscillators:
             add_phase(cycles, values, first[row], weight[row])
         if self.beat is not None:
-            cycles += self.beat[row] * self.place
+            cycles += self.beat[row] * self.sample_index
         out = phasors(cycles)
         if self.sent is not None and self.antenna is not None and self.begin is not None:
             at = self.begin[row]
@@ -113,8 +113,7 @@ class Work:
     reads, first : (T, N) weights with which samples are read farther away; the first of the
         neighbours (`isac_rt.extensions.hardware.sweep.read_at`); None: they are not
     margin : samples that a chirp has besides, before and behind, for those that are read there
-    turns : of each chirp; by its `beat` samples are turned back before they are read, their band to
-        the middle
+    common : of each chirp; its `beat` moves the samples' band to the middle before they are read
     elements : (L_rx, N) complex64, factors of each element's samples; None: 1
     noise : per sample
     saturation : power at which the amplifier saturates [W]; 0: never
@@ -123,7 +122,7 @@ class Work:
     step, most : of the converters [sqrt(W)], and half their number of steps; 0: none
     """
 
-    turns: Turns = Turns()
+    common: CommonFactor = CommonFactor()
     taps: np.ndarray | None = None
     shift: np.ndarray | None = None
     reads: np.ndarray | None = None
@@ -147,7 +146,7 @@ def finish(samples: np.ndarray, work: Work) -> np.ndarray:
     out = np.empty((groups, elements, chirps, size), np.complex64) if work.margin else samples
     power, key0, key1 = work.noise.numbers
     for row, (m, p) in enumerate(np.ndindex(groups, chirps)):
-        own = _read(samples[m, :, p], row, work) * work.turns.factor(row, size)
+        own = _read(samples[m, :, p], row, work) * work.common.factor(row, size)
         if work.elements is not None:
             own *= work.elements
         if power > 0:
@@ -162,7 +161,7 @@ def _read(own: np.ndarray, row: int, work: Work) -> np.ndarray:
     """Samples (L_rx, N) read at other places, from those of the margins too."""
     if work.taps is None and work.reads is None:
         return own
-    beat, size = work.turns.beat, own.shape[1] - 2 * work.margin
+    beat, size = work.common.beat, own.shape[1] - 2 * work.margin
     assert beat is not None
     back = own * phasors(-beat[row] * (np.arange(own.shape[1]) - work.margin))
 

@@ -67,11 +67,11 @@ def coupling_of(o: settings.Elements, positions: np.ndarray, wavelength: float) 
     out = np.eye(len(positions), dtype=complex)
     if o.coupling_db is None or len(positions) < 2:
         return out
-    apart = np.linalg.norm(positions[:, None] - positions, axis=2)
+    distance = np.linalg.norm(positions[:, None] - positions, axis=2)
     others = ~np.eye(len(positions), dtype=bool)
-    nearest = apart[others].min()
-    level = 10 ** (o.coupling_db / 20) * (nearest / apart[others]) ** 2
-    out[others] = level * np.exp(-2j * np.pi * apart[others] / wavelength)
+    nearest = distance[others].min()
+    level = 10 ** (o.coupling_db / 20) * (nearest / distance[others]) ** 2
+    out[others] = level * np.exp(-2j * np.pi * distance[others] / wavelength)
     return out
 
 

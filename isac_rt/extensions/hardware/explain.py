@@ -63,11 +63,11 @@ def unexplained_by(
 
     Raises
     ------
-    CaptureError  If the places of the elements are unknown.
+    CaptureError  If the positions of the elements are unknown.
     """
     if capture.antennas is None:
         raise CaptureError(
-            "the places of the elements are unknown, so the scene cannot be simulated; state "
+            "the positions of the elements are unknown, so the scene cannot be simulated; state "
             "elements in the description"
         )
     cube = capture.cube

@@ -153,12 +153,12 @@ class _Reader:
         width = int(self._numbers(length)[0])
         if not 0 < width <= 64:
             raise ValueError(f"names of {width} characters")
-        packed, place = bytes(names.data), names.end
+        packed, offset = bytes(names.data), names.end
         found: Tree = {}
         for begin in range(0, len(packed) - width + 1, width):
             name = packed[begin : begin + width].split(b"\0")[0].decode("latin1")
-            element = self._element(data, place)
-            place = element.end
+            element = self._element(data, offset)
+            offset = element.end
             value = self._matrix(element.data, depth=1)[1]
             if value is not None:
                 found[name] = value

@@ -97,9 +97,9 @@ class Record(NamedTuple):
 
     def at(self, time: np.ndarray) -> np.ndarray:
         """Phase at times [s], by the cubic through four neighbours [rad]."""
-        place = (np.asarray(time) - self.start) / self.step
-        first = np.floor(place).astype(np.int64)
-        weight = cubic(place - first)
+        position = (np.asarray(time) - self.start) / self.step
+        first = np.floor(position).astype(np.int64)
+        weight = cubic(position - first)
         return sum(weight[..., i] * self.values[first - 1 + i] for i in range(_SPAN))
 
     def means(self, duration: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -238,9 +238,9 @@ def _amplitudes(mask: Mask, band: _Band) -> np.ndarray:
     width = 1 / (band.size * band.step)
     lines = np.arange(int(np.ceil(band.low / width)), int(np.ceil(band.high / width)))
     offset = lines * width
-    turn = np.exp(2j * np.pi * np.outer(np.array([-1, 0, 1, 2]), offset * band.step))
+    phasors = np.exp(2j * np.pi * np.outer(np.array([-1, 0, 1, 2]), offset * band.step))
     share = (np.arange(16) + 0.5) / 16
-    kept = np.sqrt((np.abs(cubic(share) @ turn) ** 2).mean(axis=0))
+    kept = np.sqrt((np.abs(cubic(share) @ phasors) ** 2).mean(axis=0))
     size = np.sqrt(2 * mask.level(offset) * width) * (band.size / 2) / kept
     return size.astype(np.float32)
 
@@ -252,8 +252,8 @@ def oscillator_of(o: settings.Oscillator, rate: float, seed: int, name: str) -> 
     return Oscillator(Mask(o.mask_dbc_hz, o.locked), rate, seed, name)
 
 
-def spread(mask: Mask | None, apart: float, duration: float, rate: float) -> np.ndarray:
-    r"""Variances of phi(t) - phi(t - `apart`): of its mean over `duration` and of what is left
+def spread(mask: Mask | None, lag: float, duration: float, rate: float) -> np.ndarray:
+    r"""Variances of phi(t) - phi(t - `lag`): of its mean over `duration` and of what is left
     within it (2,) [rad^2].
 
     .. math:: \int 2 L(f)\, 4\sin^2(\pi f \Delta)\,\{\mathrm{sinc}^2(fT),\ 1 -
@@ -261,12 +261,12 @@ def spread(mask: Mask | None, apart: float, duration: float, rate: float) -> np.
 
     Parameters
     ----------
-    apart : Delta [s]; inf: of two oscillators, of which both have this mask
+    lag : Delta [s]; inf: of two oscillators, of which both have this mask
     """
     if mask is None:
         return np.zeros(2)
     offset = np.geomspace(SLOWEST, rate / 2, 4001)
-    shape = 2.0 if np.isinf(apart) else 4 * np.sin(np.pi * offset * apart) ** 2
+    shape = 2.0 if np.isinf(lag) else 4 * np.sin(np.pi * offset * lag) ** 2
     density = 2 * mask.level(offset) * shape
     mean = np.sinc(offset * duration) ** 2
     both = np.stack([density * mean, density * (1 - mean)])

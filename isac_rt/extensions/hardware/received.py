@@ -23,7 +23,14 @@ from functools import lru_cache
 
 import numpy as np
 
-from isac_rt.extensions.hardware.chain import Turns, Work, add_phases, finish, phasors, places_of
+from isac_rt.extensions.hardware.chain import (
+    CommonFactor,
+    Work,
+    add_phases,
+    finish,
+    phasors,
+    weights_at,
+)
 from isac_rt.extensions.hardware.converter import saturated
 from isac_rt.extensions.hardware.front_end import IDEAL, Ends
 from isac_rt.extensions.hardware.oscillator import Mask, Oscillator, Record, spread
@@ -66,7 +73,7 @@ def received(
     schedule, tones = received_tones(waveform, links, receiver, reference)
     tones = _with_elements(tones, waveform, links, receiver, ends)
     delays = np.concatenate([s.delay for _, s in links] or [np.zeros(0)])
-    turns, read = _turns(waveform, tones, ends), _read(waveform, tones, ends)
+    common, read = _common_factor(waveform, tones, ends), _read(waveform, tones, ends)
     longer = _with_margin(waveform, read.margin)
     flicker = _Flicker.of(longer, reference, ends, tones, delays)
     if flicker is None:
@@ -76,9 +83,10 @@ def received(
         rest = flicker.binned().select(np.setdiff1d(np.arange(tones.size), alone))
         samples = method.samples(longer, rest)
         for k in alone:
-            add_direct(samples, longer, tones.select(np.array([k])), turn=flicker.apart(int(k)))
-        turns = flicker.common(turns, read.margin * waveform.sample_interval)
-    read = replace(read, turns=turns, noise=noise)
+            factor = flicker.relative_factor(int(k))
+            add_direct(samples, longer, tones.select(np.array([k])), factor=factor)
+        common = flicker.common(common, read.margin * waveform.sample_interval)
+    read = replace(read, common=common, noise=noise)
     samples = finish(samples, _work(waveform, ends, read, samples))
     return IFCube(
         samples=samples,
@@ -100,10 +108,10 @@ def _lag(tones: Tones) -> np.ndarray:
     return np.zeros((1, 1)) if main is None else tones.delay[main] + tones.symbol_delay[0]
 
 
-def _turns(w: Waveform, tones: Tones, ends: Ends) -> Turns:
+def _common_factor(w: Waveform, tones: Tones, ends: Ends) -> CommonFactor:
     """Return the phase and gain that all receive elements share, oscillators excluded: gains over
     the chirp, and the difference of the two ramps."""
-    sender, out = ends.senders[0] if ends.senders else IDEAL, Turns()
+    sender, out = ends.senders[0] if ends.senders else IDEAL, CommonFactor()
     if sender.transmit_response is not None:
         late = np.rint(_lag(tones) * w.sampling_rate).astype(np.int64)
         most = max(int(late.max()), 0)
@@ -122,8 +130,8 @@ def _turns(w: Waveform, tones: Tones, ends: Ends) -> Turns:
         theirs, mine = (0.0 if r is None else r.cycles(w.fast_time) for r in ramps)
         out = replace(out, always=mine - theirs + np.zeros(w.num_samples))
         if sender.ramp is not None:
-            place = np.arange(w.num_samples) + _shift(w, tones, sender.ramp)
-            out = replace(out, place=place, beat=_by_chirp(w, _band(w, tones)))
+            sample_index = np.arange(w.num_samples) + _shift(w, tones, sender.ramp)
+            out = replace(out, sample_index=sample_index, beat=_by_chirp(w, _band(w, tones)))
     return out
 
 
@@ -189,7 +197,7 @@ def _work(w: Waveform, ends: Ends, work: Work, samples: np.ndarray) -> Work:
 def _level(samples: np.ndarray, work: Work, num_chirps: int) -> float:
     """RMS of the strongest element in a chirp like the first of each group, noise included."""
     trial = np.ascontiguousarray(samples[:, :, :1])
-    trial = finish(trial, replace(work, turns=work.turns.of_rows(num_chirps)))
+    trial = finish(trial, replace(work, common=work.common.of_rows(num_chirps)))
     return float(np.sqrt((np.abs(trial) ** 2).mean(axis=(0, 2, 3)).max())) or 1.0
 
 
@@ -293,18 +301,18 @@ class _Flicker:
                 add_phases(out, record, self.begin.ravel() - delay, sign)
         return out.reshape(*self.begin.shape, -1)
 
-    def common(self, turns: Turns, margin: float) -> Turns:
-        """`turns` with the phase of the strongest path, of samples from `margin` [s] later on."""
+    def common(self, common: CommonFactor, margin: float) -> CommonFactor:
+        """`common` with the phase of the strongest path, of samples from `margin` [s] later on."""
         theirs = self.theirs[0] if self.theirs else None
         if theirs is not None and theirs is self.mine and self.main == 0:
-            return turns
+            return common
         begin, parts = self.begin.ravel() + margin, []
         for one, late, sign in ((self.mine, 0.0, 1.0), (theirs, self.main, -1.0)):
             if one is not None:
-                parts.append((one.values, *places_of(one, begin - late, sign)))
-        return replace(turns, oscillators=tuple(parts))
+                parts.append((one.values, *weights_at(one, begin - late, sign)))
+        return replace(common, oscillators=tuple(parts))
 
-    def apart(self, path: int) -> np.ndarray:
+    def relative_factor(self, path: int) -> np.ndarray:
         """(M, P, N) complex64, the phase of a path beside the common one, as a factor."""
         theirs = self.theirs[self.tones.link[path]]
         first = self.theirs[0]
@@ -326,13 +334,13 @@ class _Flicker:
                 continue
             low, high = self.delays[of_link].min(), self.delays[of_link].max()
             width = max((high - low) / BINS, 1e-15)
-            place = np.clip((self.delays[of_link] - low) // width, 0, BINS - 1).astype(np.int64)
-            link[of_link] += place
-            cell = np.unique(place)
+            bins = np.clip((self.delays[of_link] - low) // width, 0, BINS - 1).astype(np.int64)
+            link[of_link] += bins
+            cell = np.unique(bins)
             middle = low + (cell[:, None, None] + 0.5) * width
             own = 0.0 if record is None else means[id(record)](self.begin - middle)
-            turn = main - own + np.zeros(middle.shape)
-            send[q * BINS + cell] *= np.exp(1j * turn)
+            phase = main - own + np.zeros(middle.shape)
+            send[q * BINS + cell] *= np.exp(1j * phase)
         return t._replace(
             link=link,
             send=send,
@@ -369,12 +377,12 @@ def noise_within(
     out = np.zeros(power.size)
     for q, end in enumerate(ends.senders):
         of_link = link == q
-        apart = np.abs(delays[of_link] - main)
+        lag = np.abs(delays[of_link] - main)
         if end.oscillator is first:
-            variance = within(first, w.sampled_duration, apart)
+            variance = within(first, w.sampled_duration, lag)
         else:
             two = [one for one in (first, end.oscillator) if one is not None]
-            never = np.full(apart.shape, np.inf)
+            never = np.full(lag.shape, np.inf)
             parts = [within(one, w.sampled_duration, never) / 2 for one in two]
             variance = np.sum(parts, axis=0)
         out[of_link] = power[of_link] * variance
@@ -390,13 +398,13 @@ def noise_left_out(w: Waveform, links: Links, ends: Ends, noise_power: float) ->
     return float(noise.sum() / noise_power)
 
 
-def within(oscillator: Oscillator | None, duration: float, apart: np.ndarray) -> np.ndarray:
-    """Variance of the phase within a chirp for delays that differ by `apart` (K,) [rad^2]."""
+def within(oscillator: Oscillator | None, duration: float, lag: np.ndarray) -> np.ndarray:
+    """Variance of the phase within a chirp for delays that differ by `lag` (K,) [rad^2]."""
     if oscillator is None:
-        return np.zeros(apart.shape)
+        return np.zeros(lag.shape)
     grid, table, of_two = _within(oscillator.mask, duration, oscillator.rate)
-    far = np.isinf(apart)
-    out = np.interp(np.where(far, 0.0, apart), grid, table)
+    far = np.isinf(lag)
+    out = np.interp(np.where(far, 0.0, lag), grid, table)
     out[far] = of_two
     return out
 
@@ -405,5 +413,5 @@ def within(oscillator: Oscillator | None, duration: float, apart: np.ndarray) ->
 def _within(mask: Mask, duration: float, rate: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Delays [s] and the variances within a chirp at them, and that of two oscillators."""
     grid = np.concatenate([[0.0], np.geomspace(1e-2, 1e2, 60) / rate])
-    table = np.array([spread(mask, apart, duration, rate)[1] for apart in grid])
+    table = np.array([spread(mask, lag, duration, rate)[1] for lag in grid])
     return grid, table, float(spread(mask, np.inf, duration, rate)[1])

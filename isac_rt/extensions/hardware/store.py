@@ -101,9 +101,9 @@ def save_capture(capture: Capture, file: str | Path) -> None:
     dataset = cube_dataset(capture.cube)
     if capture.antennas is not None:
         for name in ("tx", "rx"):
-            places = getattr(capture.antennas, f"{name}_positions")[:, [0, 2]]
+            positions = getattr(capture.antennas, f"{name}_positions")[:, [0, 2]]
             about = {"units": "m", "long_name": f"{name} elements to the right (x) and up (z)"}
-            dataset[f"{name}_place"] = ((f"{name}_element", "axis"), places, about)
+            dataset[f"{name}_place"] = ((f"{name}_element", "axis"), positions, about)
     dataset.attrs["source"] = json.dumps(dict(capture.source))
     write_dataset(dataset, Path(file))
 

@@ -44,10 +44,10 @@ class Response:
         """True if all elements share one response."""
         return not self.slopes.any()
 
-    def at(self, place: np.ndarray) -> np.ndarray:
+    def at(self, position: np.ndarray) -> np.ndarray:
         """Gain of the elements at places from -1 to 1 over the samples: (L, ...) complex128. Beyond
         the ends a table is held."""
-        o, x = self.of, np.asarray(place, float)
+        o, x = self.of, np.asarray(position, float)
         db, deg = np.zeros(x.shape), np.zeros(x.shape)
         for total, table in ((db, o.table_db), (deg, o.table_deg)):
             if table:
@@ -61,8 +61,8 @@ class Response:
 def sampled(response: Response, count: int, before: int = 0) -> np.ndarray:
     """Gain of each element at so many samples of a chirp, and at `before` more ahead of them:
     (L, before + count) complex64, kept for the next frame: not to be written to."""
-    place = 2 * np.arange(-before, count) / (count - 1) - 1
-    return response.at(place).astype(np.complex64)
+    position = 2 * np.arange(-before, count) / (count - 1) - 1
+    return response.at(position).astype(np.complex64)
 
 
 def response_of(o: settings.Response, size: int, seed: int, *name: str) -> Response | None:
@@ -177,7 +177,7 @@ def read_at(shift: np.ndarray) -> tuple[int, np.ndarray]:
     """
     most = int(np.ceil(max(np.abs(shift).max(initial=0.0) - 0.5, 0.0)))
     first, count = -REACH - most, 2 * (REACH + most) + 1
-    apart = shift - np.arange(first, first + count)[:, None]
-    inside = np.clip(1 - (apart / (REACH + 0.5)) ** 2, 0, None)
+    distance = shift - np.arange(first, first + count)[:, None]
+    inside = np.clip(1 - (distance / (REACH + 0.5)) ** 2, 0, None)
     window = np.where(inside > 0, np.i0(_SHAPE * np.sqrt(inside)) / np.i0(_SHAPE), 0.0)
-    return first, np.sinc(apart) * window
+    return first, np.sinc(distance) * window

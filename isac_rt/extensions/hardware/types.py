@@ -41,7 +41,7 @@ class Capture:
     Attributes
     ----------
     cube : its samples as a cube of one group, in the units of the board's converters
-    antennas : places of the elements; None where nobody stated them
+    antennas : positions of the elements; None: not stated
     source : where it comes from and what was done to it, in words
     """
 
@@ -65,7 +65,7 @@ class Capture:
         if cube.samples.shape[0] != 1:
             raise CaptureError(
                 f"the cube has {cube.samples.shape[0]} groups of chirps that overlap; channels are "
-                "told apart in a cube of 1 group"
+                "separated in a cube of 1 group"
             )
         senders = cube.schedule[0]
         silent = np.setdiff1d(np.arange(cube.waveform.num_tx), senders)

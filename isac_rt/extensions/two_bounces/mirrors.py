@@ -22,7 +22,7 @@ import numpy as np
 
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.clutter.visibility import Flight
-from isac_rt.propagation.legs.geometry import LIFT, plane_of_each_face
+from isac_rt.propagation.legs.geometry import RAY_OFFSET_M, plane_of_each_face
 from isac_rt.propagation.legs.rays import Shadows
 from isac_rt.propagation.legs.reflection import slab_coefficients
 from isac_rt.world.city.materials import Material
@@ -32,7 +32,7 @@ from isac_rt.world.swarm import Pose
 
 PLACES = 16
 """Places along a flight from which mirrors are weighed."""
-APART = 0.01
+MIN_HEIGHT_M = 0.01
 """A point this near to the plane of a mirror [m] does not show in it: it lies on the wall, or in
 its corner."""
 COARSE = Density(0.3, 2.0)
@@ -72,10 +72,10 @@ def strongest(
     at most `most`; and the share that all others send on."""
     if not most or not city.num_faces:
         return [], 0.0
-    places = flight.time_samples[
+    positions = flight.time_samples[
         np.unique(np.linspace(0, len(flight.time_samples) - 1, PLACES).round().astype(int))
     ]
-    cells = cut(city, np.ones(city.num_faces, bool), places, COARSE, seed)
+    cells = cut(city, np.ones(city.num_faces, bool), positions, COARSE, seed)
     _, group = np.unique(
         np.stack([city.plane_of_face, city.face_material.astype(np.int64)], axis=1),
         axis=0,
@@ -85,9 +85,9 @@ def strongest(
     normals, offsets = plane_of_each_face(city)
     share = np.zeros(group.max() + 1)
     sent = [_reflected(m, wavelength) for m in city.materials]
-    for place in places:
-        seen = np.flatnonzero(shadows.sees(place, cells.points, city.normals[cells.face]))
-        span = cells.points[seen] - place
+    for position in positions:
+        seen = np.flatnonzero(shadows.sees(position, cells.points, city.normals[cells.face]))
+        span = cells.points[seen] - position
         r = np.linalg.norm(span, axis=1)
         face = cells.face[seen]
         cosine = np.minimum(np.abs((span * city.normals[face]).sum(1)) / r, 1.0)
@@ -97,7 +97,7 @@ def strongest(
             back[here] = np.interp(cosine[here], np.linspace(0, 1, table.size), table)
         # a cell near by is no point: its solid angle is at most a half-space
         angle = np.minimum(cells.area[seen] * cosine / r**2, 2 * np.pi)
-        share += np.bincount(group[face], back * angle / (4 * np.pi), share.size) / len(places)
+        share += np.bincount(group[face], back * angle / (4 * np.pi), share.size) / len(positions)
     out = []
     order = np.argsort(-share, kind="stable")
     for number in order[:most]:
@@ -128,7 +128,7 @@ def _reflected(material: Material, wavelength: float) -> np.ndarray:
 
 def shown(
     shadows: Shadows,
-    place: np.ndarray,
+    position: np.ndarray,
     mirrors: list[Mirror],
     points: np.ndarray,
     normals: np.ndarray,
@@ -137,34 +137,34 @@ def shown(
 
     The wave must meet the mirror on one of its faces, and both legs must be free.
     """
-    found = [on_the_wall(points, place, m.normal, m.offset, m.corners) for m in mirrors]
+    found = [on_the_wall(points, position, m.normal, m.offset, m.corners) for m in mirrors]
     which = np.concatenate([f[0] for f in found])
     if not which.size:
         return [f[0] for f in found]
     at = np.concatenate([f[1] for f in found])
-    side = [np.sign(m.normal @ place - m.offset) * m.normal for m in mirrors]
+    side = [np.sign(m.normal @ position - m.offset) * m.normal for m in mirrors]
     wall = np.repeat(side, [f[0].size for f in found], axis=0)
-    free = shadows.sees(place, at, wall)
+    free = shadows.sees(position, at, wall)
     left = np.flatnonzero(free)
     here, there, own = points[which[left]], at[left], normals[which[left]]
     own = np.sign(((there - here) * own).sum(1))[:, None] * own
-    free[left] = shadows.clear(here + LIFT * own, there + LIFT * wall[left])
+    free[left] = shadows.clear(here + RAY_OFFSET_M * own, there + RAY_OFFSET_M * wall[left])
     ends = np.cumsum([f[0].size for f in found])
     return [f[0][part] for f, part in zip(found, np.split(free, ends[:-1]), strict=True)]
 
 
 def on_the_wall(
-    points: np.ndarray, place: np.ndarray, normal: np.ndarray, offset: float, corners: np.ndarray
+    points: np.ndarray, position: np.ndarray, normal: np.ndarray, offset: float, corners: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the points (N, 3) on the viewer's side of a mirror whose way to it from a place (3,)
     meets one of its triangles (T, 3, 3): their numbers, and where.
 
     A wave from the place comes from its image behind the wall.
     """
-    above, up = normal @ place - offset, points @ normal - offset
-    same = (up * above > 0) & (np.abs(up) >= APART) & (np.abs(above) >= APART)
+    above, up = normal @ position - offset, points @ normal - offset
+    same = (up * above > 0) & (np.abs(up) >= MIN_HEIGHT_M) & (np.abs(above) >= MIN_HEIGHT_M)
     which = np.flatnonzero(same).astype(np.int32)
-    image = mirror_image(place, normal, offset)
+    image = mirror_image(position, normal, offset)
     met = plane_crossing(image, points[which], normal, offset)
     areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = areas / np.linalg.norm(areas, axis=1, keepdims=True)

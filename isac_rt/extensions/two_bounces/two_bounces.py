@@ -43,7 +43,7 @@ from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.mirrors import mirror_image, plane_crossing
 from isac_rt.world.swarm import Pose
 
-KNOTS_KEPT = 16
+CACHED_SAMPLES = 16
 """Time samples per terminal whose tests are remembered; a frame needs six."""
 
 
@@ -59,13 +59,13 @@ class SeenByMirror:
     Attributes
     ----------
     seen : Seen; its lengths, radii and directions are those of the ways by the mirror
-    turn : (K,) complex64 of modulus 1, what the mirror does to the phase
+    phasor : (K,) complex64 of modulus 1, what the mirror does to the phase
     mirror : Mirror
     before : whether the mirror comes before the scatterer
     """
 
     seen: Seen
-    turn: np.ndarray
+    phasor: np.ndarray
     mirror: Mirror
     before: bool
 
@@ -125,11 +125,11 @@ class TwoBounces:
 
     def from_places(self, state: LinkState) -> list[SeenByMirror]:
         """The same by rays alone, wherever the ends are."""
-        places = np.array([state.start.position, state.end.position])
+        positions = np.array([state.start.position, state.end.position])
         tx, rx = (
-            (straight.astype(np.float32), [(i, np.ones(i.size)) for i in self._test(name, place)])
-            for straight, name, place in zip(
-                self._field.sight.from_places(places), state.link, places, strict=True
+            (straight.astype(np.float32), [(i, np.ones(i.size)) for i in self._test(name, at)])
+            for straight, name, at in zip(
+                self._field.sight.from_places(positions), state.link, positions, strict=True
             )
         )
         return self._between(state, tx, rx)
@@ -157,7 +157,7 @@ class TwoBounces:
         for part in self.seen(state, discs):
             s = part.seen
             points, faces = self._chain(part, state)
-            gain = cells.amplitude[s.index] * part.turn
+            gain = cells.amplitude[s.index] * part.phasor
             gain = gain * (s.magnitude * state.elements(antennas, s))
             out.append(
                 state.paths(s, gain, PathKind.DIFFUSE, bounces=2, points=points, faces=faces)
@@ -167,14 +167,14 @@ class TwoBounces:
     def _chain(self, part: SeenByMirror, state: LinkState) -> tuple[np.ndarray, np.ndarray]:
         """Points (K, 2, 3) and faces (K, 2) in the order in which the wave meets them; all faces of
         a mirror go by its largest."""
-        place = self._field.cells.points[part.seen.index]
+        points = self._field.cells.points[part.seen.index]
         own = self._field.cells.face[part.seen.index]
-        m, body = part.mirror, (state.start if part.before else state.end).position
-        image = mirror_image(body, m.normal, m.offset)
-        at = plane_crossing(image, place, m.normal, m.offset)
+        m, viewer = part.mirror, (state.start if part.before else state.end).position
+        image = mirror_image(viewer, m.normal, m.offset)
+        at = plane_crossing(image, points, m.normal, m.offset)
         wall = np.full(own.size, m.faces[0], own.dtype)
         order = slice(None) if part.before else slice(None, None, -1)
-        return np.stack([at, place], axis=1)[:, order], np.stack([wall, own], axis=1)[:, order]
+        return np.stack([at, points], axis=1)[:, order], np.stack([wall, own], axis=1)[:, order]
 
     def _share(self, name: str, pose: Pose, time: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """For each mirror of a terminal: scatterers that show in it, and how far, from 0 to 1."""
@@ -200,20 +200,20 @@ class TwoBounces:
     def _time_sample(self, name: str, time_sample: int) -> list[np.ndarray]:
         if (name, time_sample) not in self._shown:
             mine = [key for key in self._shown if key[0] == name]
-            for key in mine[: len(mine) - KNOTS_KEPT + 1]:
+            for key in mine[: len(mine) - CACHED_SAMPLES + 1]:
                 del self._shown[key]
             self._shown[name, time_sample] = self._test(
                 name, self._field.sight.flights[name].time_samples[time_sample]
             )
         return self._shown[name, time_sample]
 
-    def _test(self, name: str, place: np.ndarray) -> list[np.ndarray]:
+    def _test(self, name: str, position: np.ndarray) -> list[np.ndarray]:
         cells, mirrors = self._field.cells, self.mirrors[name]
         if not mirrors:
             return []
         return shown(
             self._field.sight.shadows,
-            place,
+            position,
             mirrors,
             cells.points,
             self._city.normals[cells.face],
@@ -240,9 +240,9 @@ class TwoBounces:
         gain = share * self._gain(mirror, seen, before)
         size = np.abs(gain)
         some = np.flatnonzero(size > 0)
-        turn = (gain[some] / size[some]).astype(np.complex64)
+        phasor = (gain[some] / size[some]).astype(np.complex64)
         seen = replace(seen, magnitude=size.astype(np.float32))
-        return SeenByMirror(Seen(*(a[some] for a in vars(seen).values())), turn, mirror, before)
+        return SeenByMirror(Seen(*(a[some] for a in vars(seen).values())), phasor, mirror, before)
 
     def _gain(self, mirror: Mirror, seen: Seen, before: bool) -> np.ndarray:
         """Complex gains (K,) of ways over scatterers that nothing hides; their own amplitudes are

@@ -1,1 +1,1 @@
-"""Clutter: drawn by a law (`rayleigh`) or pinned to the mesh (`field`)."""
+"""Clutter: drawn from a distribution (`rayleigh`) or fixed to the mesh (`field`)."""

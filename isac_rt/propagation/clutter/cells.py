@@ -1,11 +1,10 @@
-"""The surfaces of a city cut into cells, one scatterer in each: functions of the mesh, the seed and
-the flights, and of nothing else.
+"""The surfaces of a city cut into cells with one scatterer each: functions of mesh, seed and
+flights alone.
 
-Faces are halved at their longest edges until a cell's area is small against its distance to all
-that flies in the run. A cell is named by its face's corners (in the order of their coordinates) and
-by the halvings that lead to it; from the seed and this name its point and its amplitude are hashed.
-So neither the order of faces and corners, nor the process, nor what else is in the mesh changes a
-scatterer.
+Faces are halved at their longest edges until a cell's area is small for its distance to the nearest
+flight (`Density`). A hash of the seed, the face's sorted corners and the sequence of halvings gives
+the point and the amplitude of a cell. A scatterer therefore depends neither on the order of faces
+and corners, nor on the process, nor on the rest of the mesh.
 """
 
 from __future__ import annotations
@@ -25,18 +24,15 @@ from isac_rt.world.city.materials import CityError
 from isac_rt.world.city.mesh import CityMesh
 
 UNIT = 1e-6 * np.sqrt(2)
-"""World coordinates are hashed in whole multiples of this [m]. Irrational, so that no coordinate of
-a file lies where rounding could go either way after the city has been recentred and shifted
-back."""
+"""Step of world coordinates before hashing [m]. Irrational: no coordinate of a file lies half-way
+between two steps, where recentring of the city could change its rounding."""
 MOST_CELLS = 8_000_000
 
 
 @dataclass(frozen=True)
 class Density:
-    """Fineness of the cells that surfaces are cut into: an area is at most max(smallest, per_metre
-    * distance).
-
-    Near a flight it is `FINER` times smaller.
+    """Largest area of a cell: max(smallest, per_metre * distance), `FINER` times less near a
+    flight.
 
     Attributes
     ----------
@@ -51,36 +47,35 @@ class Density:
 
     @classmethod
     def of(cls, clutter: Clutter) -> Density:
-        """As a scenario asks for it."""
+        """Return the density of a scenario's settings."""
         return cls(
             clutter.cell_area_per_metre_m or area_for(clutter.max_error_db),
             clutter.smallest_cell_m2,
         )
 
     def finest(self, distance: np.ndarray) -> np.ndarray:
-        """Largest areas of cells at distances from the nearest point of any flight [m]."""
+        """Return the largest cell areas [m^2] at distances [m] from the nearest flight."""
         area = np.maximum(self.smallest, self.per_metre * distance)
         return np.where(distance < self.near, area / FINER, area)
 
 
 KNOWN_ERROR_DB, KNOWN_AREA = 0.2, 0.024
-"""Of the mean power in range cells of 4 m, that nine of ten keep to, at this area over distance
-[m]: what Munich and San Francisco show (0.17 and 0.18 dB, `docs/clutter.md`) and a tenth more."""
+"""Error of the mean power in 4 m range cells, 90th percentile, at this area over distance [m]: the
+0.17 and 0.18 dB of Munich and San Francisco (`docs/clutter.md`) with a tenth of margin."""
 
 
 def area_for(error_db: float) -> float:
-    """Area over distance [m] at which nine of ten range cells keep to an error of their mean power.
+    """Return the area over distance [m] at which the mean power of nine of ten range cells has an
+    error of `error_db` at most.
 
-    Of the surface within a range cell, cells of area A that its two edges cut count on one side or
-    the other, their whole power. There are n ~ 1/A inside and m ~ 1/sqrt(A) on the edges, so the
-    error sqrt(m)/n grows with A^(3/4). It is the same for all presets of the budget, because
-    another density is another draw of the clutter.
+    A range cell holds n ~ 1/A surface cells of area A; m ~ 1/sqrt(A) of them lie across its two
+    edges and count as a whole on one side. The relative error sqrt(m)/n grows as A^(3/4).
     """
     return float(f"{KNOWN_AREA * (error_db / KNOWN_ERROR_DB) ** (4 / 3):.6g}")
 
 
 def error_for(per_metre: float) -> float:
-    """The error [dB] at an area over distance: `area_for` the other way."""
+    """Return the error [dB] at an area over distance [m], the inverse of `area_for`."""
     return KNOWN_ERROR_DB * (per_metre / KNOWN_AREA) ** 0.75
 
 
@@ -94,9 +89,9 @@ class Cells:
     area : (N,) float32 of the cell [m^2]
     amplitude : (N,) complex64, circular Gaussian of unit power
     face : (N,) int32 face of the city's mesh
-    code : (N,) uint64 halvings of the face that lead to the cell: 1, then a bit for each
-    clock : (N,) exponential of rate `area` [1/m^2]: of any set of cells, each has the least with
-        the probability that is its share of the set's area
+    code : (N,) uint64 halvings of the face that lead to the cell: 1, then one bit per halving
+    clock : (N,) exponential variable of rate `area` [1/m^2]: in any set of cells the probability to
+        have the least is proportional to area
     """
 
     points: np.ndarray
@@ -110,29 +105,29 @@ class Cells:
         return self.area.size
 
     def select(self, which: np.ndarray) -> Cells:
-        """The cells that a mask or an index array chooses."""
+        """Select cells by a mask or an index array."""
         return Cells(*(part[which] for part in vars(self).values()))
 
 
 def cut(
     city: CityMesh,
     scattering: np.ndarray,
-    places: np.ndarray,
+    positions: np.ndarray,
     density: Density,
     seed: int,
     wanted: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
 ) -> Cells:
-    """The scatterers of a city.
+    """Cut a city into cells, one scatterer in each.
 
     Parameters
     ----------
     city : CityMesh
-    scattering : (F,) bool, faces that scatter at all
-    places : (K, 3) points along the flights of the whole run, local coordinates [m]
+    scattering : (F,) bool, faces that scatter
+    positions : (K, 3) points along the flights of the whole run, local coordinates [m]
     density : Density
     seed : of the scenario
-    wanted : says of the points (N, 3) of all scatterers and their faces (N,) which are, (N,) bool;
-        None: all
+    wanted : function that marks the scatterers to keep, (N,) bool, from their points (N, 3) and
+        faces (N,); None: all
 
     Returns
     -------
@@ -148,8 +143,8 @@ def cut(
     face, corners = face[order], corners[order]
     count, rows, *parts = leaves(
         (corners, city.areas[face], _face_state(corners + city.origin, seed)),
-        places,
-        _boxes(places),
+        positions,
+        _boxes(positions),
         (*astuple(density), city.reach),
         MOST_CELLS,
     )
@@ -171,13 +166,13 @@ def cut(
 @twin_of(propagation_cells.leaves)
 def leaves(
     faces: tuple[np.ndarray, np.ndarray, np.ndarray],
-    places: np.ndarray,
+    positions: np.ndarray,
     boxes: np.ndarray,
     density: tuple[float, float, float, float],
     most: int,
 ) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Cut faces, their corners (F, 3, 3), areas (F,) and states (F,), until each cell keeps to a
-    density; none is larger than its distance from the nearest of `places` (K, 3) allows.
+    """Cut faces with corners (F, 3, 3), areas (F,) and states (F,) until no cell is larger than
+    `density` allows at its distance from the nearest of `positions` (K, 3).
 
     Returns
     -------
@@ -186,16 +181,18 @@ def leaves(
     """
     per_metre, smallest, near, farthest = density
     corners, area, state = faces
-    row, code, tree = np.arange(len(area)), np.ones(len(area), np.uint64), cKDTree(places)
+    row, code, tree = np.arange(len(area)), np.ones(len(area), np.uint64), cKDTree(positions)
     done = [(row[:0], code[:0], area[:0])]
     points = [corners[:0]]
     while row.size:
+        # leave out cells beyond the reach of all flights
         inside = (corners.min(axis=1).max(axis=1) <= farthest) & (
             corners.max(axis=1).min(axis=1) >= -farthest
         )
         row, code, area, corners = (part[inside] for part in (row, code, area, corners))
         if sum(len(part[0]) for part in done) + len(row) > most:
             return most + 1, row[:0], code[:0], area[:0], state[:0], corners[:0, 0]
+        # least distance of a cell's bounding ball to any flight, against what its area needs
         middle = corners.mean(axis=1)
         radius = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
         distance = np.maximum(tree.query(middle)[0] - radius, 0)
@@ -203,6 +200,7 @@ def leaves(
         large = distance < np.maximum(np.where(area > smallest, area / per_metre, 0), finer)
         done.append((row[~large], code[~large], area[~large]))
         points.append(corners[~large])
+        # halve those too large
         row, area = np.repeat(row[large], 2), np.repeat(area[large] / 2, 2)
         code = (2 * code[large, None] + np.arange(2, dtype=np.uint64)).ravel()
         corners = _halves(corners[large])
@@ -214,8 +212,8 @@ def leaves(
 
 
 def _halves(corners: np.ndarray) -> np.ndarray:
-    """(2 K, 3, 3) halves of triangles (K, 3, 3), cut from the middle of the longest edge, the first
-    of those equally long."""
+    """Halve triangles (K, 3, 3) at the middle of the longest edge, the first of equal ones:
+    (2 K, 3, 3)."""
     length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     first = (length >= length.max(axis=1, keepdims=True) * (1 - ALIKE)).argmax(axis=1)
     turned = np.take_along_axis(corners, ((first[:, None] + np.arange(3)) % 3)[..., None], axis=1)
@@ -225,7 +223,7 @@ def _halves(corners: np.ndarray) -> np.ndarray:
 
 
 def _points_in(corners: np.ndarray, state: np.ndarray) -> np.ndarray:
-    """(K, 3) points, uniform in triangles (K, 3, 3), hashed from states (K,)."""
+    """Draw a point in each triangle (K, 3, 3), uniform by area, hashed from states (K,)."""
     words = np.arange(2, dtype=np.uint64)[:, None]
     hashed = (splitmix64(state, words) >> np.uint64(11)).astype(np.float64)
     one, share = ((hashed + 0.5) / 2**53)[..., None]
@@ -234,19 +232,21 @@ def _points_in(corners: np.ndarray, state: np.ndarray) -> np.ndarray:
 
 
 def _sorted_corners(corners: np.ndarray) -> np.ndarray:
-    """Corners (F, 3, 3) of each face in the order of x, then y, then z."""
+    """Sort the corners (F, 3, 3) of each face by x, then y, then z."""
     rank = np.lexsort((corners[..., 2], corners[..., 1], corners[..., 0]), axis=1)
     return np.take_along_axis(corners, rank[..., None], axis=1)
 
 
-def _boxes(places: np.ndarray) -> np.ndarray:
-    """(B, 2, 3) lowest and highest coordinates of every `BOX` places (K, 3)."""
-    first = np.arange(0, len(places), BOX)
-    return np.stack([np.minimum.reduceat(places, first), np.maximum.reduceat(places, first)], 1)
+def _boxes(positions: np.ndarray) -> np.ndarray:
+    """Return lowest and highest coordinates (B, 2, 3) of every `BOX` positions (K, 3)."""
+    first = np.arange(0, len(positions), BOX)
+    return np.stack(
+        [np.minimum.reduceat(positions, first), np.maximum.reduceat(positions, first)], 1
+    )
 
 
 def _face_state(corners: np.ndarray, seed: int) -> np.ndarray:
-    """(F,) uint64 hash of the seed and the world coordinates of (F, 3, 3) sorted corners."""
+    """Hash the seed and the world coordinates of sorted corners (F, 3, 3): (F,) uint64."""
     start = seed_sequence(seed, "scatterers").generate_state(1, np.uint64)[0]
     state = np.full(len(corners), start, np.uint64)
     words = np.rint(corners.reshape(-1, 9) / UNIT).astype(np.int64).view(np.uint64)
@@ -256,7 +256,7 @@ def _face_state(corners: np.ndarray, seed: int) -> np.ndarray:
 
 
 def _draw(state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A complex Gaussian amplitude of unit power, and an exponential of unit mean."""
+    """Draw a complex Gaussian amplitude of unit power, and an exponential variable of unit mean."""
     words = np.arange(2, 5, dtype=np.uint64)[:, None]
     uniform = ((splitmix64(state, words) >> np.uint64(11)).astype(np.float64) + 0.5) / 2**53
     amplitude = np.sqrt(-np.log(uniform[0])) * np.exp(2j * np.pi * uniform[1])

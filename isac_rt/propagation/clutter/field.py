@@ -1,23 +1,23 @@
-r"""Diffuse clutter pinned to the mesh: scatterers that stay where they are while the radar flies.
+r"""Diffuse clutter of scatterers that are fixed to the mesh, coherent while the radar flies.
 
-Each scatterer stands for one cell of a surface (`cells`) and returns, from one isotropic antenna to
-another,
+Each scatterer represents one cell of a surface (`cells`). Between two isotropic antennas its mean
+power gain is
 
 .. math::
 
     |a|^2 = (\lambda/4\pi)^2\, S^2\, \Gamma^2(\theta_i)\, f_s(k_i, k_o)\, \cos\theta_i\, A / (r_1
     r_2)^2,
 
-times its own complex-Gaussian amplitude of unit power, so that the mean power over a surface is the
-effective-roughness integral [1]_ that Sionna RT takes by shooting rays, and its speckle is Rayleigh
-however few scatterers share a cell of range and Doppler. S is the material's scattering
-coefficient, Gamma the slab's reflection (ITU-R P.2040) for the vertically polarised wave as its TE
-and TM parts meet the facet, f_s the pattern: Lambert's cos(theta_o)/pi, or lobes. Polarisation is
-kept: what comes in vertical goes out vertical, as with Sionna's default. Gamma belongs to the way
-in, so the two directions of a link differ a little.
+and its amplitude has a fixed complex-Gaussian factor of unit power. The mean power of a surface is
+then the effective-roughness integral [1]_, which Sionna RT evaluates by ray launching, and the
+speckle of a range-Doppler cell is Rayleigh for any number of scatterers. S is the material's
+scattering coefficient, Gamma the reflection of the slab (ITU-R P.2040) for the TE and TM parts of
+the vertically polarised wave, f_s the pattern: Lambert's cos(theta_o)/pi, or lobes. Polarisation is
+kept (vertical in, vertical out), as by Sionna's default. Gamma is that of the incident direction,
+so that the gains of both directions of a link differ slightly.
 
-One bounce; `isac_rt.extensions.two_bounces` adds a mirror before or after it. Delay, rate,
-acceleration and directions are float64 closed forms of the point and the poses.
+One bounce; `isac_rt.extensions.two_bounces` adds a mirror reflection before or after it. Delay,
+rate, acceleration and directions are float64 closed forms of the point and the poses.
 
 Import only after `isac_rt.runtime.activate()`.
 
@@ -66,25 +66,24 @@ from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
 
 TABLE = 4097
-"""Angles at which a material's reflectivity is tabulated, evenly in the cosine, with straight lines
-between them."""
-KEPT_SPACING = 1.0
-"""Flight of the transmitters from one test of all cells to the next [m]; a cell in sight of none of
-these places is left out."""
+"""Angles of a material's reflectivity table, uniform in the cosine; interpolated linearly."""
+TEST_SPACING_M = 1.0
+"""Spacing along transmitters' flights of the positions from which all cells are tested [m]; a cell
+visible from none is left out."""
 
 
 class Surfaces(NamedTuple):
-    """Faces and materials of a city, as the kernel needs them.
+    """Faces and materials of a city as arrays for the kernel.
 
     Attributes
     ----------
     normals : (F, 3) unit normals
     material : (F,) int64
-    table : (M, T, 3) TE and TM power reflectivity, and the pattern's norm 1/F, over the cosine of
+    table : (M, T, 3) TE and TM power reflectivity, and the norm 1/F of the lobe, over the cosine of
         incidence from 0 to 1
     coefficient : (M,) S^2
-    lobe : (M,) share of the lobe about the mirror direction; -1 for Lambert's pattern
-    exponent : (M,) of the lobes
+    lobe : (M,) share of the lobe about the mirror direction; -1: Lambert's pattern
+    exponent : (M,) alpha of the lobes
     """
 
     normals: np.ndarray
@@ -99,14 +98,13 @@ class Surfaces(NamedTuple):
 class Seen(ScatterPaths):
     """K scatterers of the field between two terminals at one instant, isotropic antennas.
 
-    Float32 where that is enough (magnitude, acceleration); what both ends of a terminal's own link
-    share is one array.
+    Magnitude and acceleration are float32. On a monostatic link both ends share arrays.
 
     Attributes
     ----------
     index : (K,) int32 into the field's cells
-    magnitude : (K,) square root of the mean power gain; sight included, the scatterer's own
-        amplitude not
+    magnitude : (K,) square root of the mean power gain, visibility included, without the
+        scatterer's complex-Gaussian factor
     """
 
     index: np.ndarray
@@ -119,7 +117,7 @@ class Seen(ScatterPaths):
 
 
 class Rows(NamedTuple):
-    """The arrays of `Seen` in their order, as the kernels take them."""
+    """Arrays of `Seen`, in its order, for the kernels."""
 
     length: np.ndarray
     rate: np.ndarray
@@ -145,9 +143,12 @@ def advance(
     own: bool,
     rows: Rows,
 ) -> None:
-    """Fill all rows (K,) but `cell`: path length, its rate and acceleration, directions towards the
-    cells, and the square root of the mean power gain. `start`, `end` (3, 3): position, velocity,
-    acceleration of the ends; `own`: both are one."""
+    """Fill in all `rows` (K,) but `cell`: path length with rate and acceleration, directions
+    towards the cells, and the square root of the mean power gain.
+
+    `start`, `end` (3, 3): position, velocity, acceleration of the ends; `own`: a monostatic link.
+    """
+    # geometry of both path segments
     i = rows.cell
     n, first = surfaces.normals[face[i]], motion_to(points[i], start)
     last = first if own else motion_to(points[i], end)
@@ -157,21 +158,22 @@ def advance(
     rows.departure[:], rows.arrival[:] = first[3], last[3]
     u, v = first[3], last[3]
     into, back = (u * n).sum(axis=1), (v * n).sum(axis=1)
-    # TE is along u x n, of which the vertical field holds its part across the horizontal u x z
+    # share of TE (along u x n) in the power of the vertical field
     whole = (u[:, 0] ** 2 + u[:, 1] ** 2) * (1 - np.minimum(np.abs(into), 1.0) ** 2)
     across = (n[:, 1] * u[:, 0] - n[:, 0] * u[:, 1]) ** 2
     part = np.where(whole > 1e-12, np.minimum(across / np.maximum(whole, 1e-12), 1.0), 0.5)
+    # mean power gain of the module's docstring, with visibility; 0 through the surface
     power = scattered_power(surfaces, face[i], area[i], into, back, (u * v).sum(axis=1), part)
     gain = scale * share[i] * np.sqrt(np.maximum(power, 0.0)) / (first[0] * last[0])
     rows.magnitude[:] = np.where(into * back > 0, gain, 0.0)
 
 
-def motion_to(points: np.ndarray, body: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Distance (K,) of a moving body (3, 3) from points (K, 3), its rate and acceleration, and the
-    unit vectors towards the points."""
-    place, velocity, acceleration = body
-    r = np.linalg.norm(points - place, axis=1)
-    u = (points - place) / r[:, None]
+def motion_to(points: np.ndarray, terminal: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the distance (K,) of a terminal (3, 3) in motion from points (K, 3), its rate and
+    acceleration, and the unit vectors towards the points."""
+    position, velocity, acceleration = terminal
+    r = np.linalg.norm(points - position, axis=1)
+    u = (points - position) / r[:, None]
     rate = -u @ velocity
     return r, rate, (velocity @ velocity - rate**2) / r - u @ acceleration, u
 
@@ -185,11 +187,10 @@ def scattered_power(
     between: np.ndarray,
     part: np.ndarray,
 ) -> np.ndarray:
-    """Power (K,) that cells scatter into a direction, per steradian and unit of power density: the
-    integrand of effective roughness without its distances.
+    """Return S^2 Gamma^2 f_s cos(theta_i) A (K,) of cells, the bistatic cross-section over 4 pi.
 
-    `into` and `back` are the cosines of incidence and departure with signs, `between` that of the
-    angle between them, `part` the share of the field that is TE.
+    `into` and `back` are the signed cosines of incidence and departure, `between` the cosine of the
+    angle between both directions, `part` the share of TE in the power.
     """
     m, grid = surfaces.material[face], np.linspace(0, 1, surfaces.table.shape[1])
     cosine = np.minimum(np.abs(into), 1.0)
@@ -206,16 +207,16 @@ def scattered_power(
 
 
 class Scatterers(NamedTuple):
-    """Scatterers that a link sees, and from where."""
+    """Scatterers of a link, and their visibility."""
 
     cells: Cells
     sight: Visibility
 
 
 class ClutterField:
-    """The scatterers of one run, the same in all frames; `plan` makes it.
+    """Scatterers of one run, the same in all frames; built by `plan`.
 
-    All links see the same ones, but for those which are `merged` where a link's noise covers them.
+    All links have the same scatterers, except those `merged` below the noise of a link.
     """
 
     def __init__(
@@ -232,9 +233,9 @@ class ClutterField:
         self.cells = cells
         self.merged = merged or {}
         self.num_candidates = num_candidates
-        """Cells of the whole city, those that are never in sight included."""
+        """Number of cells of the whole city, visible or not."""
         self.overlap = overlap
-        """Area in sight that lies in two surfaces or more, and scatters once [m^2]."""
+        """Visible area in two surfaces or more, which scatters once [m^2]."""
         self.surfaces = surfaces(city, wavelength)
         self._wavelength, self._scale = wavelength, wavelength / (4 * np.pi)
 
@@ -249,20 +250,20 @@ class ClutterField:
         seed: int,
         floor: NoiseFloor | None = None,
     ) -> ClutterField:
-        """Cut the surfaces for the whole run's flights, and keep what any transmitter sees from any
-        place of its flight. Where there is a `floor`, leave out what no element sends or receives,
-        and merge what the noise of each link covers."""
+        """Cut the surfaces for all flights of a run, and keep the cells that are visible from some
+        transmitter's flight. With a `floor`, also leave out cells outside every antenna's field of
+        view, and merge those below the noise of each link."""
         flights = {
             name: Flight(swarm.trajectories[name], swarm.duration, city.origin)
             for name in swarm.terminals
         }
-        places = np.concatenate([flight.time_samples for flight in flights.values()])
+        positions = np.concatenate([flight.time_samples for flight in flights.values()])
         scatters = np.array([m.scattering_coefficient > 0 for m in city.materials], bool)[
             city.face_material
         ]
         shadows = Shadows(scene)
         senders = [flights[name] for name in swarm.transmitters]
-        lookouts, behind = _kept_places(senders), floor is None or floor.antennas.look_back
+        lookouts, behind = _test_positions(senders), floor is None or floor.antennas.look_back
         fronts = [] if behind else [flight.fronts for flight in senders]
 
         def found() -> dict[str, Any]:
@@ -275,12 +276,12 @@ class ClutterField:
                 out[out] = shadows.ever_sees(lookouts, points[out], city.normals[face[out]])
                 return out
 
-            cells = cut(city, scatters, places, density, seed, in_sight)
+            cells = cut(city, scatters, positions, density, seed, in_sight)
             twice = lies_twice(cells, city)
             again = float(cells.area[twice].sum())
             return {"cells": vars(cells.select(~twice)), "of": of, "overlap": again}
 
-        depends_on = [plain(city), places, lookouts, fronts, asdict(density), seed, MOST_CELLS]
+        depends_on = [plain(city), positions, lookouts, fronts, asdict(density), seed, MOST_CELLS]
         had = kept("cells", [*depends_on, mi.variant()], found)
         cells = Cells(**had["cells"])
         sight = Visibility(shadows, flights, facets_of(cells, city), wavelength, city)
@@ -296,18 +297,18 @@ class ClutterField:
         merged = kept(
             "merged",
             [*depends_on, mi.variant()],
-            lambda: field._below_noise(floor, poses, density, places),
+            lambda: field._below_noise(floor, poses, density, positions),
         )
         return field._with(
             {link: field._own(link, Cells(**merged[str(link)])) for link in floor.over_noise}
         )
 
     def of(self, link: Link) -> Scatterers:
-        """Return the scatterers that a link sees."""
+        """Return the scatterers of a link."""
         return self.merged.get(link, Scatterers(self.cells, self.sight))
 
     def whole(self) -> ClutterField:
-        """The same field with nothing merged."""
+        """Return the field without merging."""
         return self._with({})
 
     def _with(self, merged: Mapping[Link, Scatterers]) -> ClutterField:
@@ -315,7 +316,7 @@ class ClutterField:
         return ClutterField(*whole, self.num_candidates, self.overlap, merged)
 
     def _own(self, link: Link, cells: Cells) -> Scatterers:
-        """Cells that a link alone sees."""
+        """Build the scatterers of one link from its cells."""
         flights = {name: self.sight.flights[name] for name in link}
         facets = facets_of(cells, self._city)
         sight = Visibility(self.sight.shadows, flights, facets, self._wavelength, self._city)
@@ -326,19 +327,19 @@ class ClutterField:
         floor: NoiseFloor,
         poses: dict[str, list[Pose]],
         density: Density,
-        places: np.ndarray,
+        positions: np.ndarray,
     ) -> dict[str, dict[str, np.ndarray]]:
-        """The cells of each link, merged where noise covers them (`merging`); `poses` at the
-        instants of `floor`, local."""
+        """Return the cells of each link, merged below its noise (`merging`); `poses` are local, at
+        the instants of `floor`."""
         cells, sight = self.cells, self.sight
-        finest = density.finest(cKDTree(places).query(cells.points)[0])
+        finest = density.finest(cKDTree(positions).query(cells.points)[0])
         error = error_for(density.per_metre)
         seen = {
             name: sight.from_places(np.array([pose.position for pose in of]))
             for name, of in poses.items()
         }
         ever = {
-            name: sight.ever(_kept_places([sight.flights[name]]), known=np.any(at, axis=0))
+            name: sight.ever(_test_positions([sight.flights[name]]), known=np.any(at, axis=0))
             for name, at in seen.items()
         }
         merged = {}
@@ -358,9 +359,9 @@ class ClutterField:
     def _visible(
         self, floor: NoiseFloor, cells: Cells, share: np.ndarray, state: LinkState, level: float
     ) -> VisibleCells:
-        """Return a link's paths over cells that both ends see by shares (N,); `level` is the power
-        of a path over the noise, per power gain."""
-        scatter_paths = self._ways(cells, share, state)
+        """Return a link's scatterers with the visibility `share` (N,); `level` is the power of a
+        path over the noise, per power gain."""
+        scatter_paths = self._paths_over(cells, share, state)
         power = (
             level * (scatter_paths.magnitude * state.elements(floor.antennas, scatter_paths)) ** 2
         )
@@ -375,21 +376,21 @@ class ClutterField:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the scatterers and of what is remembered of their sight."""
+        """Memory of the scatterers and of the stored visibility [bytes]."""
         every = [(self.cells, self.sight), *self.merged.values()]
         return sum(a.nbytes for cells, _ in every for a in vars(cells).values()) + sum(
             sight.nbytes for _, sight in every
         )
 
     def seen(self, state: LinkState, discs: UavDiscs | None = None) -> Seen:
-        """Return the scatterers in sight of both ends of a link, poses in local coordinates; in the
-        shadows of `discs`, if given."""
+        """Return the scatterers visible from both ends of a link, poses in local coordinates, with
+        the shadows of `discs`."""
         (tx, rx), own, start, end = state.link, state.link.own, state.start, state.end
         cells, sight = self.of(state.link)
         share = sight.share(tx, start, state.epoch)
         if not own:
             share = share * sight.share(rx, end, state.epoch)
-        found = self._ways(cells, share, state)
+        found = self._paths_over(cells, share, state)
         if discs is not None:
             points = cells.points.take(found.index, axis=0)
             sent, visible = (discs.spared([(name,)]) for name in (tx, rx))
@@ -407,14 +408,14 @@ class ClutterField:
         return Seen(*(parts[id(a)] for a in vars(found).values()))
 
     def from_places(self, state: LinkState) -> Seen:
-        """Return the scatterers in sight of both ends by rays alone, at any place; poses in local
-        coordinates."""
+        """Return the scatterers visible from both ends by rays alone, on or off the planned
+        flights; poses in local coordinates."""
         ends = np.array([state.start.position, state.end.position])
         one, other = self.sight.from_places(ends)
-        return self._ways(self.cells, (one & other).astype(np.float32), state)
+        return self._paths_over(self.cells, (one & other).astype(np.float32), state)
 
-    def _ways(self, cells: Cells, share: np.ndarray, state: LinkState) -> Seen:
-        """Return the paths over the cells that both ends see by shares (N,) other than 0."""
+    def _paths_over(self, cells: Cells, share: np.ndarray, state: LinkState) -> Seen:
+        """Return the paths over cells with a visibility `share` (N,) other than 0."""
         own, start, end = state.link.own, state.start, state.end
         index = np.flatnonzero(share).astype(np.int32)
         count = index.size
@@ -436,7 +437,7 @@ class ClutterField:
         return found
 
     def paths(self, state: LinkState, antennas: Antennas, discs: UavDiscs | None = None) -> PathSet:
-        """The link's paths; poses, points and UAVs in local coordinates."""
+        """Return the link's paths; poses, points and UAVs in local coordinates."""
         seen, cells = self.seen(state, discs), self.of(state.link).cells
         return state.paths(
             seen,
@@ -449,25 +450,25 @@ class ClutterField:
 
 
 def facets_of(cells: Cells, city: CityMesh) -> Facets:
-    """Where cells lie and how they are turned."""
+    """Return points, normals and areas of cells."""
     return Facets(cells.points, city.normals[cells.face], cells.area)
 
 
 def in_local(pose: Pose, origin: np.ndarray) -> Pose:
-    """A pose in local coordinates."""
+    """Shift a pose to local coordinates."""
     return replace(pose, position=pose.position - origin)
 
 
-def _kept_places(flights: Sequence[Flight]) -> np.ndarray:
-    """(K, 3) places of the flights from which cells are tested."""
-    step = round(KEPT_SPACING / SAMPLE_SPACING)
+def _test_positions(flights: Sequence[Flight]) -> np.ndarray:
+    """Return the positions (K, 3) along flights from which cells are tested."""
+    step = round(TEST_SPACING_M / SAMPLE_SPACING)
     return np.concatenate(
         [part for f in flights for part in (f.time_samples[::step], f.time_samples[-1:])]
     )
 
 
 def surfaces(city: CityMesh, wavelength: float) -> Surfaces:
-    """Tables of a city's materials."""
+    """Build the material tables of a city."""
     cosine = np.linspace(0.0, 1.0, TABLE)
     table = []
     for m in city.materials:
@@ -485,11 +486,10 @@ def surfaces(city: CityMesh, wavelength: float) -> Surfaces:
 
 
 def lobe_norm(material: Material, cosine: np.ndarray) -> np.ndarray:
-    """Integral over the half-space of the lobe ((1 + cos psi)/2)^alpha about a direction
-    (Degli-Esposti [1]_, eqs. 13 and 15).
+    """Integrate the lobe ((1 + cos psi)/2)^alpha over the half-space (Degli-Esposti [1]_, eqs. 13
+    and 15).
 
-    The lobes about the mirror direction and about the way in have one exponent, so both have this
-    norm.
+    The lobes about the mirror and the incident direction have the same exponent and norm.
     """
     alpha = material.pattern_exponent
     if material.scattering_pattern == "lambertian":

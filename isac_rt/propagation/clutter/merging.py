@@ -1,27 +1,26 @@
-r"""Scatterers merged, link by link, where noise covers them.
+r"""Merging of scatterers below the noise, link by link.
 
-A range-Doppler cell that holds C times its noise in clutter shows an error of the clutter as the
-share C/(1 + C) of it. So the area that one scatterer may stand for grows where C is small: the
-error of a cell's clutter grows with area^(3/4) (`cells.area_for`), and that of noise plus clutter
-stays what `clutter.max_error_db` allows as long as
+Let C be the clutter-to-noise ratio of a range-Doppler cell. A relative error of its clutter is an
+error of C/(1 + C) times that of noise plus clutter. Three limits keep the latter within
+`clutter.max_error_db`, e as a share:
+
+1. Distribution over cells. The error of a cell's clutter grows as area^(3/4) (`cells.area_for`), so
+   one scatterer may represent the area
 
 .. math:: A \le A_0\,((1 + C)/C)^{4/3},
 
-A_0 the area that the surface is cut to. That says how the clutter is spread over cells on average;
-a cell with n scatterers at random errs by the share 1/sqrt(n) of C, so that none may hold more
-than s(1 + C)^2/C of the noise, nor more than q(1 + C), since a faint cell with one scatterer
-instead of many shows all of it or nothing; s and q go with the square of the error allowed. They
-are set for a street whose clutter lies about the noise, the worst there is: a link takes up to six
-times of both where nine of ten of its range-Doppler cells keep the error all the same at every
-instant, and nine of ten of those whose clutter is over the noise. Nor does one scatterer hold more
-than a sixth of a cell's clutter where that is over the noise: fewer would fix the cell's level by a
-single draw.
+   A_0 the area without merging.
+2. Random power. With n scatterers the clutter varies by 1/sqrt(n): the power of one over the noise
+   is at most s (1 + C)^2/C, and at most q (1 + C) in faint cells, with s and q proportional to e^2.
+   Both are set for clutter near the noise, the worst case; a link uses up to six times of both if
+   the 90th percentile of the errors stays within e at all instants.
+3. Speckle. Where C > 1, one scatterer holds at most C/6.
 
-The two halves of a cell merge while their joint area keeps the least of these limits over all
-scatterers that they hold and all instants of the run. What is merged has the coherent sum of the
-halves' amplitudes, weighted by the roots of their areas, which is Gaussian of unit power again, and
-the place of one of them, drawn by area: its mean power is that of both wherever shadows fall. Each
-link has one such cut for the whole run, so that nothing jumps.
+Two halves of a cell merge while their joint area is within the least limit of all scatterers that
+they hold, at all instants of the run. The amplitude of the merged scatterer is the coherent sum,
+weighted by the roots of the areas, which is Gaussian of unit power again. Its position is that of
+one half, drawn by area, so the mean power is right behind shadow edges too. A link is merged once
+for the whole run, without jumps between frames.
 """
 
 from __future__ import annotations
@@ -39,26 +38,25 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.clutter.cells import Cells
 
 FEWEST = 6
-"""Scatterers of a cell whose clutter is over the noise."""
-ALL_ERR = 4.0
-"""s over the square of the error that nine of ten cells keep to: what merges stays near, mostly in
-the same cell."""
-ONE_ERRS = 42.0
-"""q over the square of the error: most cells are faint."""
-EASED = (6.0, 3.0, 2.0, 1.0)
-"""Times of s and q that are tried in turn; the last is taken unseen."""
+"""Least number of scatterers in a cell with clutter over the noise."""
+GROUP_LIMIT = 4.0
+"""s / e^2; merged scatterers are neighbours, mostly in one cell."""
+SINGLE_LIMIT = 42.0
+"""q / e^2; most cells are faint."""
+LIMIT_FACTORS = (6.0, 3.0, 2.0, 1.0)
+"""Factors on s and q, tried in this order; the last is used without a test."""
 
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """The noise that covers faint clutter, at instants of a run.
+    """Noise of each link at instants of a run.
 
     Attributes
     ----------
     waveform, antennas : of the run
-    longest_delay : of a path that is received at all [s]
-    times : (K,) rising [s]
-    over_noise : by link (K,) the power of a path over the noise of a range-Doppler cell, per power
+    longest_delay : of a received path [s]
+    times : (K,) increasing [s]
+    over_noise : by link (K,) power of a path over the noise of a range-Doppler cell, per power
         gain; 0 where the link is not received
     """
 
@@ -69,29 +67,29 @@ class NoiseFloor:
     over_noise: Mapping[Link, np.ndarray]
 
     def record(self) -> str:
-        """All of it, as text."""
+        """Return all attributes as text, for the key of a cache."""
         links = {str(link): factors.tolist() for link, factors in self.over_noise.items()}
         instruments = asdict(self.waveform), asdict(self.antennas)
         return json.dumps([*instruments, self.longest_delay, self.times.tolist(), links])
 
 
 def resolution_cell(waveform: Waveform, delay: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """(K,) int64 number of the range-Doppler cell in which paths of these delays [s] and delay
-    rates are seen; velocities alias."""
+    """Return the number (K,) int64 of the range-Doppler cell of delays [s] and delay rates;
+    velocities alias."""
     w = waveform
     beat = np.rint(w.slope * delay * w.sampled_duration).astype(np.int64)
-    turns = np.rint(w.effective_carrier * rate * w.frame_duration).astype(np.int64)
-    return beat * w.num_chirps + turns % w.num_chirps
+    doppler_cycles = np.rint(w.effective_carrier * rate * w.frame_duration).astype(np.int64)
+    return beat * w.num_chirps + doppler_cycles % w.num_chirps
 
 
 class VisibleCells(NamedTuple):
-    """Scatterers as a link receives them at one instant.
+    """Scatterers that a link receives at one instant.
 
     Attributes
     ----------
-    which : (K,) of those that are received
+    which : (K,) indices
     power : (K,) mean power over the noise of a range-Doppler cell
-    cell : (K,) int from 0 in which each is seen
+    cell : (K,) int, number of the range-Doppler cell
     """
 
     which: np.ndarray
@@ -102,80 +100,79 @@ class VisibleCells(NamedTuple):
 def merged_below_noise(
     cells: Cells, visible: Sequence[VisibleCells], finest: np.ndarray, error_db: float
 ) -> Cells:
-    """Merge a link's scatterers as far as noise covers the error.
+    """Merge a link's scatterers within the limits of the module's docstring.
 
     Parameters
     ----------
-    visible : at the instants that show how the run changes
-    finest : (N,) area to which the surface is cut at each of the N cells [m^2]
-    error_db : of noise plus clutter that nine of ten range-Doppler cells keep to
+    visible : received scatterers at instants of the run
+    finest : (N,) area A_0 of each cell [m^2]
+    error_db : 90th percentile of the error of noise plus clutter
     """
-    for eased in EASED:
-        limit = np.full(len(cells), np.inf)
+    for factor in LIMIT_FACTORS:
+        limit = np.full(len(cells), np.inf)  # least over the instants
         for some in visible:
-            area = allowed_area(some, cells.area, finest, 10 ** (error_db / 10) - 1, eased)
+            area = allowed_area(some, cells.area, finest, 10 ** (error_db / 10) - 1, factor)
             limit[some.which] = np.minimum(limit[some.which], area)
         place, left = merge(cells, limit)
         times = np.zeros(len(cells))
         times[place] = left.area / cells.area[place]
-        if eased == EASED[-1] or _within(error_db, times, visible):
+        if factor == LIMIT_FACTORS[-1] or _within(error_db, times, visible):
             break
     return left
 
 
 def _within(error_db: float, times: np.ndarray, visible: Sequence[VisibleCells]) -> bool:
-    """Return whether nine of ten range-Doppler cells keep an error at every instant, among all and
-    among those whose clutter is over the noise, if scatterers (N,) represent multiples of their
-    power."""
+    """Test the 90th percentile of the error at each instant, over all range-Doppler cells and over
+    those with C > 1, if scatterers represent `times` (N,) their power."""
     for which, power, cell in visible:
         every, left = np.bincount(cell, power), np.bincount(cell, power * times[which])
         held = np.flatnonzero(every)
-        error, loud = apart_db(every[held], left[held]), every[held] > 1
+        error, loud = difference_db(every[held], left[held]), every[held] > 1
         if any(np.quantile(e, 0.9) > error_db for e in (error, error[loud]) if e.size):
             return False
     return True
 
 
-def apart_db(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the difference of noise plus clutter between two clutters over the noise [dB]."""
+def difference_db(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the difference of noise plus clutter between two clutter-to-noise ratios [dB]."""
     return np.abs(10 * np.log10((1 + other) / (1 + one)))
 
 
 def allowed_area(
-    visible: VisibleCells, area: np.ndarray, finest: np.ndarray, error: float, eased: float
+    visible: VisibleCells, area: np.ndarray, finest: np.ndarray, error: float, factor: float
 ) -> np.ndarray:
-    """Largest areas that scatterers may stand for at one instant.
+    """Return the largest areas that scatterers may represent at one instant.
 
     Parameters
     ----------
-    area : (N,) that each stands for [m^2]
-    finest : (N,) to which the surface is cut there [m^2]
-    error : of noise plus clutter that is allowed, as a share
-    eased : times that s and q are taken
+    area : (N,) that each represents [m^2]
+    finest : (N,) A_0 [m^2]
+    error : e, of noise plus clutter
+    factor : times that s and q are taken
 
     Returns
     -------
     area : (K,) of those that are received [m^2]
     """
     which, power, cell = visible
-    clutter = np.bincount(cell, power)[cell]
+    clutter = np.bincount(cell, power)[cell]  # C of each scatterer's cell
     over = (1 + clutter) / clutter
-    most = eased * error**2 * (1 + clutter) * np.minimum(ONE_ERRS, ALL_ERR * over)
+    most = factor * error**2 * (1 + clutter) * np.minimum(SINGLE_LIMIT, GROUP_LIMIT * over)
     most = np.where(clutter > 1, np.minimum(most, clutter / FEWEST), most)
     return np.minimum(finest[which] * over ** (4 / 3), area[which] * most / power)
 
 
 def merge(cells: Cells, limit: np.ndarray) -> tuple[np.ndarray, Cells]:
-    """Cells whose halves are merged, again and again, while their area keeps to a limit.
+    """Merge halves of cells repeatedly while their area is within a limit.
 
     Parameters
     ----------
-    limit : (N,) area that what holds each of the N cells may have [m^2]
+    limit : (N,) largest area of a merged cell that holds each cell [m^2]
 
     Returns
     -------
-    place : (M,) which of the N cells each that is left stands in the place of
-    cells : M that are left
+    place : (M,) index of the cell at whose point each merged cell lies
+    cells : M merged cells
     """
     halvings = np.frexp(cells.code.astype(float))[1] - 1
     along = cells.code << (62 - halvings).astype(np.uint64)
@@ -200,22 +197,23 @@ def merged(
     clock: np.ndarray,
     limit: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Merge the halves of cells (N,), the finest first, while their area keeps to the least limit.
+    """Merge the halves of cells (N,), the finest first, while their area is within the least limit.
 
-    The half whose exponential clock of a rate in proportion to its area rings first stands for
-    both; amplitudes add, weighted by the roots of the areas. What does not merge is left, and so is
-    what would merge with it.
+    The half with the smaller `clock`, an exponential variable of rate `area`, gives the point;
+    amplitudes add, weighted by the roots of the areas. Halves that do not merge end the merging of
+    the cells that hold them.
 
     Returns
     -------
-    place, area, amplitude : (M,) of what is left, as each is known to be left in a walk through the
-        faces: by the last cell of what held it, the finest first
+    place, area, amplitude : (M,) merged cells, ordered by the last cell of their parent, the finest
+        first
     """
     every = np.arange(len(area))
     sums = (np.sqrt(area) * amplitude).astype(complex)
     nodes = [face, code, every, area.astype(float), limit, sums, every]
     waiting, left = [part[:0] for part in nodes], []
     for level in range(halvings.max(initial=0), -1, -1):
+        # cells of this level, sorted by face and code: halves of one cell are neighbours
         waiting = [
             np.append(w, part[halvings == level]) for w, part in zip(waiting, nodes, strict=True)
         ]
@@ -224,11 +222,14 @@ def merged(
         half = name >> np.uint64(1)
         one = np.flatnonzero((faces[1:] == faces[:-1]) & (half[1:] == half[:-1]) & (level > 0))
         other, least = one + 1, np.minimum(most[one], most[one + 1])
-        both = size[one] + size[other]
+        both = size[one] + size[other]  # joint area
         joins = (place[one] >= 0) & (place[other] >= 0) & (both <= least)
-        apart = np.stack([one, other], axis=1)[~joins].ravel() if level else np.arange(len(name))
+        separate = np.stack([one, other], axis=1)[~joins].ravel() if level else np.arange(len(name))
         last[one] = last[other]
-        left.append([part[apart] for part in (last, place, size, total)] + [apart * 0 - level])
+        left.append(
+            [part[separate] for part in (last, place, size, total)] + [separate * 0 - level]
+        )
+        # merged cells go on to the next level at the point of the half with the smaller clock
         first = np.where(clock[place[other]] < clock[place[one]], place[other], place[one])
         place[one], size[one], most[one] = np.where(joins, first, -1), both, least
         total[one] += total[other]

@@ -1,17 +1,15 @@
-r"""Where a flight carries the sight of scatterers across shadow edges, and how wide the penumbra is
-there.
+r"""Crossings of shadow edges along a flight, and the width of the penumbra.
 
-A scatterer that is seen from one time sample of a flight and not from the next has crossed a shadow
-edge in between. Rays bisect the place; the ray that just fails hits what is in the way within
-millimetres of its edge, so that the edge is that of the triangle hit which is nearest. From it come
-the distances d_1 (to the terminal) and d_2 (to the scatterer) and the direction m across the edge
-and the ray, and with them the flight that takes the scatterer one Fresnel unit into the shadow,
+A scatterer that is visible from one time sample of a flight and not from the next has crossed a
+shadow edge in between. Rays find the crossing by bisection. The last blocked ray hits the blocking
+triangle within millimetres of the shadow edge, which is therefore its nearest side. With d_1 the
+distance from the edge to the terminal, d_2 to the scatterer, and m the direction across edge and
+ray, one Fresnel unit is the length of flight
 
 .. math:: \sigma = \frac{d_1}{d_2\,|v \cdot m|} \sqrt{\frac{\lambda d_2 (d_1 + d_2)}{2 d_1} + w^2},
 
-v the unit vector of the flight and w half the width of the scatterer's cell across the edge: a cell
-is no point, and the shadow's edge takes that long to cross it. About the crossing the Fresnel
-parameter is taken linear in the flight.
+v the unit vector of the flight and w half the width of the scatterer's cell across the edge. Near
+the crossing the Fresnel parameter is linear in the flight.
 
 Import only after `isac_rt.runtime.activate()`.
 """
@@ -26,22 +24,20 @@ import mitsuba as mi
 import numpy as np
 
 from isac_rt.propagation.legs.diffraction import knife_edge
-from isac_rt.propagation.legs.geometry import LIFT
+from isac_rt.propagation.legs.geometry import RAY_OFFSET_M
 from isac_rt.propagation.legs.rays import Triangles, computed, rays
 
 HALVINGS = 6
-"""Of the flight between two time samples; what is left is 8 mm of half a metre."""
+"""Bisections between two time samples: 8 mm of half a metre."""
 REACH = 4.0
-"""Fresnel units on either side after which a scatterer is dark or lit; the ripple and the tail are
-6 % there, and tapered."""
+"""Fresnel units from the edge to full light or shadow; ripple and tail of 6 % are tapered to it."""
 HALF_WIDTH = 0.7
-"""Half the width of a cell over the root of its area: half a side of a right triangle with two
-equal ones."""
+"""Half the width of a cell over the root of its area, as of a right isosceles triangle."""
 _UNITS = np.linspace(-REACH, REACH, 1025)
 
 
 def _tables() -> tuple[np.ndarray, np.ndarray]:
-    """Knife-edge factor over Fresnel units into the light, exactly 0 and 1 at both ends."""
+    """Tabulate the knife-edge factor over Fresnel units, tapered to 0 and 1 at the ends."""
     x = np.clip((np.abs(_UNITS) - REACH / 2) / (REACH / 2), 0, 1)
     far = x * x * (3 - 2 * x)
     factor = (1 - far) * knife_edge(-_UNITS) + far * (_UNITS > 0)
@@ -52,20 +48,20 @@ _REAL, _IMAG = _tables()
 
 
 def penumbra(units: np.ndarray) -> np.ndarray:
-    """(N,) complex factor of an edge; `units` (N,) from the edge of the shadow into the light."""
+    """Return the complex knife-edge factor at Fresnel units (N,), positive in the light."""
     return np.interp(units, _UNITS, _REAL) + 1j * np.interp(units, _UNITS, _IMAG)
 
 
 @dataclass(frozen=True)
 class Crossings:
-    """K scatterers that come into sight or are lost between two time samples.
+    """K scatterers whose visibility changes between two time samples.
 
     Attributes
     ----------
     index : (K,) int32
-    where : (K,) float32 share of the way from time sample to time sample
+    where : (K,) float32 position of the crossing, from 0 to 1 between the time samples
     width : (K,) float32 flight per Fresnel unit [m]; inf where the edge was not found
-    gained : (K,) bool, seen from the second time sample
+    gained : (K,) bool, visible from the second time sample
     """
 
     index: np.ndarray
@@ -75,15 +71,15 @@ class Crossings:
 
 
 class Facets(NamedTuple):
-    """N points on surfaces with unit normals (N, 3), local coordinates, and the areas (N,) of the
-    cells that they stand for [m^2]."""
+    """N points on surfaces with unit normals (N, 3), local coordinates, and the areas (N,) of
+    their cells [m^2]."""
 
     points: np.ndarray
     normals: np.ndarray
     area: np.ndarray
 
     def select(self, which: np.ndarray) -> Facets:
-        """The points that an index array chooses."""
+        """Select points by an index array."""
         return Facets(self.points[which], self.normals[which], self.area[which])
 
 
@@ -94,13 +90,13 @@ def crossings(
     facets: Facets,
     wavelength: float,
 ) -> Crossings:
-    """Return what changes between two time samples (2, 3), for N points on surfaces, seen (2, N)
-    from either."""
+    """Find the crossings between two time samples (2, 3), for N points with visibility `seen`
+    (2, N)."""
     index = np.flatnonzero(seen[0] != seen[1]).astype(np.int32)
     gained = seen[1][index].astype(bool)
     some = facets.select(index)
     low, high = np.zeros(index.size), np.ones(index.size)
-    for _ in range(HALVINGS if index.size else 0):
+    for _ in range(HALVINGS if index.size else 0):  # bisection
         middle = (low + high) / 2
         ray = _rays(some, _between(time_samples, middle))
         now = ~computed(triangles.scene.ray_test(ray))
@@ -115,13 +111,13 @@ def _between(time_samples: np.ndarray, share: np.ndarray) -> np.ndarray:
     return time_samples[0] + share[:, None] * (time_samples[1] - time_samples[0])
 
 
-def _rays(facets: Facets, places: np.ndarray) -> mi.Ray3f:
-    """From points lifted off their surfaces to a place each."""
-    side = np.sign(((places - facets.points) * facets.normals).sum(1))
-    start = facets.points + LIFT * side[:, None] * facets.normals
-    span = places - start
+def _rays(facets: Facets, positions: np.ndarray) -> mi.Ray3f:
+    """Build rays from points, lifted off their surfaces, to one position each."""
+    side = np.sign(((positions - facets.points) * facets.normals).sum(1))
+    start = facets.points + RAY_OFFSET_M * side[:, None] * facets.normals
+    span = positions - start
     length = np.linalg.norm(span, axis=1)
-    return rays(start, span / length[:, None], length - LIFT)
+    return rays(start, span / length[:, None], length - RAY_OFFSET_M)
 
 
 def _widths(
@@ -131,22 +127,24 @@ def _widths(
     facets: Facets,
     wavelength: float,
 ) -> np.ndarray:
-    """(K,) flight per Fresnel unit at the edges that hide points from the shares `dark` of the way
-    between two time samples."""
+    """Return sigma (K,) [m] of the edges that hide points from the positions `dark`, between 0 and
+    1, between two time samples."""
     points, normals, area = facets
     if not points.shape[0]:
         return np.zeros(0)
-    places = _between(time_samples, dark)
-    hit = triangles.scene.ray_intersect_preliminary(_rays(facets, places))
+    # blocking triangle of the last blocked ray
+    positions = _between(time_samples, dark)
+    hit = triangles.scene.ray_intersect_preliminary(_rays(facets, positions))
     dr.eval(hit)  # once, not for each of its parts
     near, triangle = np.asarray(hit.t, np.float64), triangles.rows(hit)
     found = triangle >= 0
     corners = triangles.corners[triangle].astype(float)
-    span = points - places
+    span = points - positions
     length = np.linalg.norm(span, axis=1)
     ray = span / length[:, None]
-    behind = np.clip(near, LIFT, length - LIFT)
+    behind = np.clip(near, RAY_OFFSET_M, length - RAY_OFFSET_M)
     at = points - behind[:, None] * ray
+    # its side nearest to the hit, and m
     along = np.roll(corners, -1, axis=1) - corners
     size = np.maximum(np.linalg.norm(along, axis=2, keepdims=True), 1e-9)
     along = along / size
@@ -156,6 +154,7 @@ def _widths(
     across = np.cross(edge, ray)
     size = np.linalg.norm(across, axis=1)
     across /= np.maximum(size, 1e-9)[:, None]
+    # sigma of the module's docstring
     flight = time_samples[1] - time_samples[0]
     pace = np.abs(across @ (flight / np.linalg.norm(flight)))
     before = length - behind

@@ -1,9 +1,9 @@
-"""The paper's urban clutter: a run of range cells with Rayleigh amplitudes that stand still, on top
-of any propagation model.
+"""The paper's urban clutter: consecutive range cells with static Rayleigh amplitudes, added to any
+propagation model.
 
 The paper (section V.A) says: Rayleigh amplitudes "with the noise variance as 1", on average 10 dB
 over the target's; 40 to 50 consecutive range cells; their centre drawn between 20 and 30 m;
-velocity 0. What it leaves open is settled here so:
+velocity 0. The choices it leaves open are:
 
 - 10 dB of mean power over the link's reference path: at a PT its line of sight, which the paper
   calls its target;
@@ -15,9 +15,8 @@ velocity 0. What it leaves open is settled here so:
   a wave leaves where it comes from, between two terminals the two directions are independent;
 - cells are independent of each other.
 
-Each scatterer is a path of kind DIFFUSE with a delay rate of exactly 0: clutter that stands still
-relative to the receiver, which a city does for a hovering one only. Being a path of the
-transmitter's chirps it carries their data, as the paper does not say.
+Each scatterer is a path of kind DIFFUSE with delay rate 0, static relative to the receiver, as a
+city is for a hovering one only. As an echo of the transmitted chirps it carries their data.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from isac_rt.world.swarm import Pose
 def rayleigh_cells(
     clutter: Clutter, range_cell: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One draw of the run.
+    """Draw the clutter of one link and frame.
 
     Parameters
     ----------

@@ -1,10 +1,11 @@
-"""Visibility: shadow rays, and the visibility of a scatterer along a flight.
+"""Visibility of scatterers along a flight.
 
-Rays are tested from time samples, places every half metre along a flight as it is planned. Where a
-scatterer is seen from one time sample and not from the next, `penumbra` finds the shadow edge in
-between, and about it sight is the modulus of the knife edge's factor; several crossings add up as
-the apertures do that they bound. Sight is a function of the time alone: a frame is the same whether
-the frames before it were computed or not. Import only after `isac_rt.runtime.activate()`."""
+Shadow rays are tested from time samples, every half metre of the planned flight. Where visibility
+changes between two of them, `penumbra` finds the shadow edge; near it visibility is the modulus of
+the knife-edge factor. Factors of several crossings add as those of the apertures that they bound.
+Visibility is a function of time alone: a frame does not depend on the frames computed before it.
+Import only after `isac_rt.runtime.activate()`.
+"""
 
 from __future__ import annotations
 
@@ -24,33 +25,31 @@ from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Trajectory
 
 SAMPLE_SPACING = 0.5
-"""Flight from one test of the rays to the next [m]."""
+"""Spacing of time samples along a flight [m]."""
 OFF_FLIGHT = 1e-3
-"""A pose farther than this from the planned flight [m] has its rays tested by itself."""
+"""Distance from the planned flight beyond which a pose has shadow rays of its own [m]."""
 REACH = 3
-"""Time samples on each side that matter to a blend, which is how sight by way of mirrors comes and
-goes."""
+"""Time samples on each side in the blend of visibility over mirrors."""
 AROUND = 8
-"""Time samples on each side whose crossings are known."""
-TOGETHER = 4
-"""Time samples that are tested, and kept for later runs, at once."""
+"""Time samples on each side whose crossings are included."""
+SAMPLES_PER_BATCH = 4
+"""Time samples tested and cached at a time."""
 BORESIGHT_SAMPLES = 81
-"""Instants of a run at which it is asked what lies before a terminal."""
+"""Instants of a run at which boresights are sampled."""
 WIDEST = (AROUND - 1) / PENUMBRA
-"""Widest penumbra, in time samples per Fresnel unit: it must have passed when its crossing is
-forgotten."""
+"""Widest penumbra [time samples per Fresnel unit]: it ends within `AROUND` of its crossing."""
 BLEND = BSpline.basis_element(np.arange(-REACH, REACH + 1))
 
 
 class Flight:
-    """One terminal's way through a run, with its time samples.
+    """Flight of one terminal in a run, with its time samples.
 
     Parameters
     ----------
     trajectory : of the terminal
     duration : of the run [s]
     origin : (3,) of the local coordinates [m]
-    spacing : most flight from time sample to time sample [m]
+    spacing : largest spacing of time samples [m]
     """
 
     def __init__(
@@ -76,36 +75,36 @@ class Flight:
 
     @cached_property
     def fronts(self) -> np.ndarray:
-        """(S, 5) planes across the boresights that the terminal has in the run: a unit vector, how
-        far along it begins what lies before such a plane [m], and how far a boresight turns from
-        one of the `BORESIGHT_SAMPLES` to the next [rad]."""
+        """Planes (S, 5) across the boresights of the run: unit normal, offset of the half-space in
+        front of the terminal [m], and largest change of the boresight between two of the
+        `BORESIGHT_SAMPLES` [rad]."""
         poses = [
             self._trajectory.pose(time) for time in self._times[:: 2000 // (BORESIGHT_SAMPLES - 1)]
         ]
-        places = np.array([pose.position for pose in poses]) - self._origin
+        positions = np.array([pose.position for pose in poses]) - self._origin
         boresights = np.array([pose.rotation[:, 1] for pose in poses])
-        step, turn = (
-            np.linalg.norm(np.diff(a, axis=0), axis=1).max() for a in (places, boresights)
+        step, tilt = (
+            np.linalg.norm(np.diff(a, axis=0), axis=1).max() for a in (positions, boresights)
         )
         each, row = np.unique(boresights, axis=0, return_inverse=True)
         begins = np.full(len(each), np.inf)
-        np.minimum.at(begins, row.ravel(), (places * boresights).sum(axis=1) - step)
-        return np.column_stack([each, begins, np.full(len(each), turn)])
+        np.minimum.at(begins, row.ravel(), (positions * boresights).sum(axis=1) - step)
+        return np.column_stack([each, begins, np.full(len(each), tilt)])
 
     def holds(self, pose: Pose, time: float) -> bool:
-        """Return whether a pose, local, is the planned one."""
+        """Test that a pose, local, lies on the planned flight."""
         return bool(
             np.linalg.norm(self._trajectory.pose(time).position - self._origin - pose.position)
             < OFF_FLIGHT
         )
 
     def number(self, time: float) -> float:
-        """Time samples passed at a time, a fraction of the way to the next included."""
+        """Return the fractional number of the time sample at a time [s]."""
         return float(np.interp(time, self._times, self._distance) / self.spacing)
 
     def blend(self, time: float) -> dict[int, float]:
-        """Time samples that matter at a time, with their weights, which sum to one: a quintic
-        B-spline over the way flown."""
+        """Return the time samples about a time [s] with their weights, a quintic B-spline over the
+        flight; the weights sum to one."""
         q = self.number(time)
         nearby = np.arange(np.ceil(q - REACH), q + REACH)
         out: dict[int, float] = {}
@@ -119,18 +118,18 @@ class Flight:
 
 
 def ever_ahead(fronts: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(N,) whether points (N, 3), local, lie before any of some `Flight.fronts` (S, 5), or so near
-    to one that they might between two `BORESIGHT_SAMPLES`."""
-    normals, begins, turn = np.split(fronts, [3, 4], axis=1)
+    """Mark the points (N, 3), local, in front of any of `Flight.fronts` (S, 5), with the margin of
+    boresights between two `BORESIGHT_SAMPLES`."""
+    normals, begins, tilt = np.split(fronts, [3, 4], axis=1)
     farthest = np.linalg.norm(points, axis=1).max(initial=0.0)
     out = np.zeros(len(points), bool)
-    for normal, begin in zip(normals, begins - turn * farthest, strict=True):
+    for normal, begin in zip(normals, begins - tilt * farthest, strict=True):
         out |= points @ normal > begin
     return out
 
 
 class _Stretch(NamedTuple):
-    """`TOGETHER` time samples of a flight and the next: bits (TOGETHER + 1, N / 8) of what each
+    """`SAMPLES_PER_BATCH` time samples of a flight and the next: bits (T + 1, N / 8) of what each
     sees, and what crosses an edge between two of them."""
 
     seen: np.ndarray
@@ -176,16 +175,19 @@ class Visibility:
         )
 
     def share(self, name: str, pose: Pose, time: float) -> np.ndarray:
-        """(N,) float32 for a terminal at a pose, local coordinates."""
+        """Return the visibility (N,) float32 from a terminal at a pose, local coordinates."""
         flight = self.flights[name]
         if not flight.holds(pose, time):
             return self.from_places(pose.position[None])[0].astype(np.float32)
+        # rays at the nearest time sample, corrected by the crossings about it
         q = flight.number(time)
         time_sample = int(np.clip(np.rint(q), 0, len(flight.time_samples) - 1))
         if name not in self._nearby or self._nearby[name].time_sample != time_sample:
             self._nearby[name] = self._near(name, time_sample)
         near = self._nearby[name]
-        bits = self._stretch(name, time_sample // TOGETHER).seen[time_sample % TOGETHER]
+        bits = self._stretch(name, time_sample // SAMPLES_PER_BATCH).seen[
+            time_sample % SAMPLES_PER_BATCH
+        ]
         out = np.unpackbits(bits, count=len(self._facets.points)).astype(np.float32)
         if near.row.size:
             step = np.where(near.gained, 1, -1) * (
@@ -199,25 +201,32 @@ class Visibility:
             out[near.index] = np.abs(some)
         return out
 
-    def from_places(self, places: np.ndarray) -> np.ndarray:
-        """(K, N) bool what is seen from places (K, 3), by rays alone."""
-        return self.shadows.all_seen(places, self._facets.points, self._facets.normals)
+    def from_places(self, positions: np.ndarray) -> np.ndarray:
+        """Return the visibility (K, N) bool from positions (K, 3), by rays alone."""
+        return self.shadows.all_seen(positions, self._facets.points, self._facets.normals)
 
-    def ever(self, places: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """(N,) bool what is seen from any of places (K, 3), by rays alone, or `known` to be."""
+    def ever(self, positions: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """Return the visibility (N,) bool from any of positions (K, 3), by rays alone; `known` to
+        be visible already."""
         out, left = known.copy(), np.flatnonzero(~known)
         points, normals = self._facets.points[left], self._facets.normals[left]
-        out[left] = self.shadows.ever_sees(places, points, normals)
+        out[left] = self.shadows.ever_sees(positions, points, normals)
         return out
 
     def _near(self, name: str, time_sample: int) -> _Nearby:
-        """The crossings that matter about a time sample, as one list."""
+        """Collect the crossings about a time sample."""
         flight = self.flights[name]
         spans = range(
             max(time_sample - AROUND, 0), min(time_sample + AROUND, len(flight.time_samples) - 1)
         )
-        parts = [self._stretch(name, n // TOGETHER).crossed[n % TOGETHER] for n in spans]
-        reach = range((time_sample - AROUND) // TOGETHER, (time_sample + AROUND) // TOGETHER + 1)
+        parts = [
+            self._stretch(name, n // SAMPLES_PER_BATCH).crossed[n % SAMPLES_PER_BATCH]
+            for n in spans
+        ]
+        reach = range(
+            (time_sample - AROUND) // SAMPLES_PER_BATCH,
+            (time_sample + AROUND) // SAMPLES_PER_BATCH + 1,
+        )
         for key in [k for k in self._stretches if k[0] == name and k[1] not in reach]:
             del self._stretches[key]
         if not parts:
@@ -239,10 +248,10 @@ class Visibility:
         )
 
     def _stretch(self, name: str, number: int) -> _Stretch:
-        """Return what is visible, and what crosses edges, along a stretch of a flight."""
+        """Return visibility and crossings of a batch of time samples."""
         if (name, number) not in self._stretches:
             time_samples = self.flights[name].time_samples[
-                TOGETHER * number : TOGETHER * (number + 1) + 1
+                SAMPLES_PER_BATCH * number : SAMPLES_PER_BATCH * (number + 1) + 1
             ]
 
             def found() -> dict[str, Any]:
@@ -258,7 +267,7 @@ class Visibility:
         return self._stretches[name, number]
 
     def _crossings(self, time_samples: np.ndarray, seen: np.ndarray) -> Crossings:
-        """Return what crosses an edge between two time samples (2, 3), seen (2, N) from either."""
+        """Return the crossings between two time samples (2, 3) with visibility `seen` (2, N)."""
         return crossings(self.shadows.triangles, time_samples, seen, self._facets, self._wavelength)
 
 

@@ -23,7 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 from isac_rt.propagation.clutter.visibility import Flight
-from isac_rt.propagation.legs.geometry import LIFT
+from isac_rt.propagation.legs.geometry import RAY_OFFSET_M
 from isac_rt.propagation.legs.rays import rays
 from isac_rt.storage import checksum, kept, pack
 from isac_rt.world.city.mesh import CityMesh
@@ -33,7 +33,7 @@ from isac_rt.world.swarm import Pose
 
 AROUND = 2
 """Time samples on each side of the nearest one whose chains are pooled."""
-TOGETHER = AROUND + 1
+SAMPLES_PER_BATCH = AROUND + 1
 """Time samples whose chains are sought, and kept for later runs, at once: no more than the first
 frame needs."""
 FAR = 1e6
@@ -103,7 +103,7 @@ class Search:
         if name not in self._pools or self._pools[name][0] != time_sample:
             found = [self._time_sample(name, flight, n) for n in self._window(time_sample)]
             self._pools[name] = time_sample, self._pool(found)
-            far = TOGETHER + AROUND
+            far = SAMPLES_PER_BATCH + AROUND
             for key in [k for k in self._kept if k[0] == name and abs(k[1] - time_sample) > far]:
                 del self._kept[key]
         return self._pools[name][1]
@@ -116,19 +116,19 @@ class Search:
 
     def _time_sample(self, name: str, flight: Flight, number: int) -> Chains:
         if (name, number) not in self._kept:
-            first, count = number // TOGETHER * TOGETHER, len(flight.time_samples)
-            near = range(max(first, -AROUND), min(first + TOGETHER, count + AROUND))
-            places = flight.time_samples[np.clip(near, 0, count - 1)]
+            first, count = number // SAMPLES_PER_BATCH * SAMPLES_PER_BATCH, len(flight.time_samples)
+            near = range(max(first, -AROUND), min(first + SAMPLES_PER_BATCH, count + AROUND))
+            positions = flight.time_samples[np.clip(near, 0, count - 1)]
 
             def found() -> list[list[np.ndarray]]:
                 return [
-                    [*self._sent(*time_sample)] for time_sample in zip(places, near, strict=True)
+                    [*self._sent(*time_sample)] for time_sample in zip(positions, near, strict=True)
                 ]
 
             city = self._city
             mesh = [city.vertices, city.faces, city.plane_of_face]
             self._mesh = self._mesh or checksum(*pack(mesh))
-            search = [places, [*near], self._num_rays, self._depth, mi.variant()]
+            search = [positions, [*near], self._num_rays, self._depth, mi.variant()]
             for n, tree in zip(near, kept("chains", [self._mesh, *search], found), strict=True):
                 self._kept[name, n] = Chains(*tree)
         return self._kept[name, number]
@@ -146,11 +146,11 @@ class Search:
             new = [np.concatenate([n[:-1], s, n[-1:]]) for n, s in zip(new, split, strict=True)]
         return levels.chains()
 
-    def _sent(self, place: np.ndarray, number: int) -> Chains:
+    def _sent(self, position: np.ndarray, number: int) -> Chains:
         """Chains that the rays of a time sample meet."""
         levels = _Levels(self._city.num_faces)
         along = directions(self._num_rays, number)
-        at, chain = np.broadcast_to(place, along.shape), np.full(len(along), -1)
+        at, chain = np.broadcast_to(position, along.shape), np.full(len(along), -1)
         last = chain
         for _ in range(self._depth):
             way, face = self._hit(at, along)
@@ -160,7 +160,7 @@ class Search:
             chain = levels.grown(chain[on], last)
             normal = self._city.normals[face]
             side = np.sign((along * normal).sum(1))[:, None]
-            at = at + way[:, None] * along - LIFT * side * normal
+            at = at + way[:, None] * along - RAY_OFFSET_M * side * normal
             along = mirror_image(along, normal)
         return levels.chains()
 
@@ -207,6 +207,6 @@ def directions(count: int, number: int) -> np.ndarray:
     number."""
     i, golden = np.arange(count), (np.sqrt(5) - 1) / 2
     z = 1 - 2 * (i + (0.5 + _SHIFT * number) % 1) / count
-    turn = 2 * np.pi * ((golden * i + _TURN * number) % 1)
+    azimuth = 2 * np.pi * ((golden * i + _TURN * number) % 1)
     flat = np.sqrt(1 - z**2)
-    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z], axis=1)

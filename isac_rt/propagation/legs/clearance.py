@@ -15,7 +15,7 @@ loses its reflection, one exactly on it sees both sides; from a centimetre on al
 
 
 class ClearanceWarning(UserWarning):
-    """A body is so near to a surface that paths over it may be missing."""
+    """A UAV so near to a surface that paths over it may be missing."""
 
 
 class Clearance:
@@ -25,18 +25,18 @@ class Clearance:
         self._city = city
         self._warned: set[str] = set()
 
-    def check(self, places: Mapping[str, np.ndarray], time: float) -> None:
+    def check(self, positions: Mapping[str, np.ndarray], time: float) -> None:
         """Warn of UAVs at local positions (3,)."""
-        city, names = self._city, [name for name in places if name not in self._warned]
-        every = np.array([places[name] for name in names]).reshape(-1, 3)
-        body, face = _beside(city.normals, city.plane_offsets, *city.boxes, every, CLEARANCE)
-        for number in np.unique(body):
-            name, near = names[number], face[body == number]
-            apart = float(distance_to_triangles(city.corners[near], places[name]).min())
-            if apart < CLEARANCE:
+        city, names = self._city, [name for name in positions if name not in self._warned]
+        every = np.array([positions[name] for name in names]).reshape(-1, 3)
+        uav, face = _beside(city.normals, city.plane_offsets, *city.boxes, every, CLEARANCE)
+        for number in np.unique(uav):
+            name, near = names[number], face[uav == number]
+            distance = float(distance_to_triangles(city.corners[near], positions[name]).min())
+            if distance < CLEARANCE:
                 self._warned.add(name)
                 warnings.warn(
-                    f"{name} is {apart:.3f} m from a surface of {city.name} at {time:.4g} s: "
+                    f"{name} is {distance:.3f} m from a surface of {city.name} at {time:.4g} s: "
                     f"within {CLEARANCE} m the ray tracer loses "
                     "reflections and may see through the surface; fly it farther off",
                     ClearanceWarning,
@@ -49,13 +49,13 @@ def _beside(
     offsets: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
-    places: np.ndarray,
+    positions: np.ndarray,
     most: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the places (K, 3) and the faces (F,) in whose planes and boxes, but for so much, they
     lie: numbers of both."""
-    near = np.abs(normals @ places.T - offsets[:, None]) < most
+    near = np.abs(normals @ positions.T - offsets[:, None]) < most
     face, place = np.nonzero(near)
-    here = places[place]
+    here = positions[place]
     inside = ((low[face] - most < here) & (here < high[face] + most)).all(axis=1)
     return place[inside], face[inside]

@@ -75,24 +75,24 @@ def direct_legs(
 
     `points` (.., 1, 3) of a leg holds the edge round which it bends, else NaN.
     """
-    apart = [
+    separated = [
         pair
         for pair in pairs
         if np.linalg.norm(poses[pair[1]].position - poses[pair[0]].position) > 1e-9
     ]
     starts, ends = (
-        np.array([poses[pair[k]].position for pair in apart]).reshape(-1, 3) for k in (0, 1)
+        np.array([poses[pair[k]].position for pair in separated]).reshape(-1, 3) for k in (0, 1)
     )
     bends = edges.bends(starts, ends)
     factors = edge_factor(bends.nu)
-    spared, there = discs.spared(apart), factors != 0
+    spared, there = discs.spared(separated), factors != 0
     straight_on, round_edge = there & (bends.nu <= 0), there & (bends.nu > 0)
     for which, *between in ((straight_on,), (round_edge, bends.points)):
         stops = np.stack([stop[which] for stop in (starts, *between, ends)], axis=1)
         factors[which] *= discs.factor(stops, wavelength, spared[which])
     out = {}
     for k in np.flatnonzero(there):
-        start, end = (poses[name] for name in apart[k])
+        start, end = (poses[name] for name in separated[k])
         direct = straight(start, end.position[None], end.velocity, end.acceleration)
         leg, factor = replace(direct, points=np.full((1, 1, 3), np.nan)), factors[k]
         if round_edge[k]:
@@ -100,7 +100,7 @@ def direct_legs(
             # the detour's phase is in its delay
             factor = factor * np.exp(2j * np.pi * (leg.length - direct.length) / wavelength)
         friis = wavelength / (4 * np.pi * direct.length)
-        out[apart[k]] = friis * factor, leg
+        out[separated[k]] = friis * factor, leg
     return out
 
 

@@ -22,25 +22,25 @@ class UavDiscs:
     Attributes
     ----------
     names : of the N UAVs that have a size
-    places : (N, 3) [m]
+    positions : (N, 3) [m]
     radii : (N,) [m]
     """
 
     names: tuple[str, ...]
-    places: np.ndarray
+    positions: np.ndarray
     radii: np.ndarray
 
     @classmethod
     def of(cls, uavs: Mapping[str, Uav], poses: dict[str, Pose]) -> UavDiscs:
         """UAVs of a scenario's UAVs where they are."""
         names = tuple(name for name, uav in uavs.items() if uav.body_radius_m > 0 and name in poses)
-        places = np.array([poses[name].position for name in names]).reshape(-1, 3)
-        return cls(names, places, np.array([uavs[name].body_radius_m for name in names]))
+        positions = np.array([poses[name].position for name in names]).reshape(-1, 3)
+        return cls(names, positions, np.array([uavs[name].body_radius_m for name in names]))
 
     def spared(self, names: Sequence[Collection[str]]) -> np.ndarray:
         """(R, N) which UAVs are at the ends of each of R legs, or echo: a body does not shadow
         itself."""
-        rows = [[body in of_leg for body in self.names] for of_leg in names]
+        rows = [[uav in of_leg for uav in self.names] for of_leg in names]
         return np.array(rows, bool).reshape(len(rows), len(self.names))
 
     def factor(self, chain: np.ndarray, wavelength: float, spared: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ class UavDiscs:
 
     def sight(
         self,
-        place: np.ndarray,
+        position: np.ndarray,
         points: np.ndarray,
         distance: np.ndarray,
         wavelength: float,
@@ -76,8 +76,8 @@ class UavDiscs:
         """(K,) modulus of the factor from one place (3,) to points (K, 3) at known distances (K,)
         [m]."""
         factor, out = np.ones(len(points), complex), np.ones(len(points))
-        place, before = np.broadcast_to(place, points.shape), np.zeros(len(points))
-        path = self._shade(factor, place, points, before, distance, wavelength, spared)
+        position, before = np.broadcast_to(position, points.shape), np.zeros(len(points))
+        path = self._shade(factor, position, points, before, distance, wavelength, spared)
         out[path] = np.abs(factor[path])
         return out
 
@@ -88,10 +88,10 @@ class UavDiscs:
         `total`; the paths that a body is near, once for each."""
         # one layout, for which `near` is compiled once
         starts, ends, before = (np.array(a, order="C") for a in (starts, ends, before))
-        path, body, off, along = near(
-            starts, ends, before, total, self.places, self.radii, spared, wavelength, LIT_REACH
+        path, uav, off, along = near(
+            starts, ends, before, total, self.positions, self.radii, spared, wavelength, LIT_REACH
         )
-        radius = self.radii[body]
+        radius = self.radii[uav]
         far = np.maximum(total[path] - along, radius)  # nearer than its own size a disc is none
         unit = fresnel_unit(wavelength, np.maximum(along, radius), far)
         nu, size = off / unit, radius / unit
@@ -100,7 +100,7 @@ class UavDiscs:
 
 
 @twin_of(propagation_discs.near)
-def near(starts, ends, before, total, places, radii, spared, wavelength, reach):
+def near(starts, ends, before, total, positions, radii, spared, wavelength, reach):
     """Find the straight segments (K,) that pass a disc (N,) within `reach` Fresnel units of its
     edge, unless `spared` (K or 1, N).
 
@@ -108,13 +108,13 @@ def near(starts, ends, before, total, places, radii, spared, wavelength, reach):
     ----------
     starts, ends : (K, 3) of the segments [m]
     before, total : (K,) distance along the path before the segment, and of the whole path [m]
-    places, radii : (N, 3) and (N,) of the discs [m]
+    positions, radii : (N, 3) and (N,) of the discs [m]
 
     Returns
     -------
     segment and disc of each pass, distance of the disc's centre and distance along the path [m]
     """
-    span, to = ends - starts, places - starts[:, None]
+    span, to = ends - starts, positions - starts[:, None]
     square = np.maximum((span**2).sum(axis=1), np.finfo(float).tiny)[:, None]
     dot = (to * span[:, None]).sum(axis=2)
     across = np.sqrt(np.maximum((to**2).sum(axis=2) - dot**2 / square, 0.0))

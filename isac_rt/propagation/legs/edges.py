@@ -26,7 +26,7 @@ from isac_rt.world.city.mesh import CityMesh
 BESIDE = 0.01
 """How far beside an edge rays are sent that find out which side of it is free [m]; float32 rays are
 good to a hundredth of that."""
-TOGETHER, STRIP = 32, 30.0
+EDGES_PER_BLOCK, STRIP = 32, 30.0
 """Edges of a block, which are passed over at once, and width of the strips in which edges are
 gathered [m]."""
 FLAT = 1e-3
@@ -42,7 +42,7 @@ class Edges(NamedTuple):
     wings : (E, 2, 3) third corners of the two faces; the same twice where a surface ends
     middle : (E, 3) [m]
     half : (E,) half the length [m]
-    block, centre, radius : (C, TOGETHER) edges near each other, -1 where there are fewer, and the
+    block, centre, radius : (C, EDGES_PER_BLOCK) neighbouring edges, padded with -1, and the
         balls (C, 3), (C,) that hold them [m]
     """
 
@@ -79,12 +79,12 @@ class Edges(NamedTuple):
         wings = city.vertices[np.stack([third[first], third[second]], axis=1)]
         span = city.vertices[ends[first, 1]] - start
         middle, half = start + span / 2, np.linalg.norm(span, axis=1) / 2
-        count = -(-len(half) // TOGETHER)
-        block = np.full((count, TOGETHER), -1)
+        count = -(-len(half) // EDGES_PER_BLOCK)
+        block = np.full((count, EDGES_PER_BLOCK), -1)
         block.flat[: len(half)] = np.lexsort([middle[:, 1], middle[:, 0] // STRIP])
         centre = middle[block[:, 0]]
-        apart = np.linalg.norm(middle[block] - centre[:, None], axis=2) + half[block]
-        radius = np.where(block < 0, 0.0, apart).max(axis=1, initial=0.0)
+        extent = np.linalg.norm(middle[block] - centre[:, None], axis=2) + half[block]
+        radius = np.where(block < 0, 0.0, extent).max(axis=1, initial=0.0)
         return cls(start, span, wings, middle, half, block, centre, radius)
 
 
@@ -164,8 +164,8 @@ def near(
     for end in (source, sink):
         foot.append(((end - edges.start) * unit).sum(axis=1))
         off.append(np.linalg.norm(np.cross(end - edges.start, unit), axis=1))
-    apart = off[0] + off[1]
-    at = (foot[0] * off[1] + foot[1] * off[0]) / np.maximum(apart, 1e-9)
+    off_sum = off[0] + off[1]
+    at = (foot[0] * off[1] + foot[1] * off[0]) / np.maximum(off_sum, 1e-9)
     point = edges.start + np.clip(at, 0, 2 * edges.half)[:, None] * unit
     way = sum(np.linalg.norm(point - end, axis=1) for end in (source, sink))
     detour = way - np.linalg.norm(sink - source)
@@ -173,7 +173,7 @@ def near(
     size = np.linalg.norm(normal, axis=1)
     # a silhouette: both faces lie on one side of the plane of the path and the edge
     side = ((edges.wings - edges.start[:, None]) * normal[:, None]).sum(axis=2)
-    some = (apart >= 1e-9) & (detour <= reach) & (size >= 1e-6) & (side.prod(axis=1) > 0)
+    some = (off_sum >= 1e-9) & (detour <= reach) & (size >= 1e-6) & (side.prod(axis=1) > 0)
     which = np.flatnonzero(some)
     which = which[np.argsort(detour[which], kind="stable")][:MOST_TRIED]
     out = normal[which] / np.where(side[which, :1] < 0, 1, -1) / size[which, None]

@@ -15,7 +15,7 @@ from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.mirrors import mirror_image, plane_crossing
 from isac_rt.world.swarm import Pose
 
-LIFT = 2e-3
+RAY_OFFSET_M = 2e-3
 """Rays start this far from the surface and end as far before the viewer [m]; float32 corners and
 rays are good to a tenth of it."""
 

@@ -29,7 +29,7 @@ from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.propagation_images import WIDER
 from isac_rt.propagation.legs.chains import Chains
 from isac_rt.propagation.legs.geometry import (
-    LIFT,
+    RAY_OFFSET_M,
     Legs,
     edges_in_any_order,
     one_of_each_chain,
@@ -43,11 +43,11 @@ from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.mirrors import mirror_image, plane_crossing
 from isac_rt.world.swarm import Pose
 
-ASIDE = np.array([[0.061, -0.047, 0.064], [0.052, 0.073, -0.044]])
+PROBES_M = np.array([[0.061, -0.047, 0.064], [0.052, 0.073, -0.044]])
 """From a terminal to the points beside it to which corners are sought, local coordinates [m]. A
 tenth of a metre is what Sionna's ray offsets need (3 cm: half of the corners, 1 cm: none) and less
 than a Fresnel zone; two points, because one that lies towards the corner does not help."""
-SLACK = float(4 * np.linalg.norm(ASIDE, axis=1).max())
+SLACK = float(4 * np.linalg.norm(PROBES_M, axis=1).max())
 """Most by which the points of a corner's path may differ between the terminal and a point beside it
 [m], and `STRETCH` of the path's length."""
 STRETCH = 1e-3
@@ -171,11 +171,11 @@ class Images:
     ) -> np.ndarray:
         """(K, 2 + depth) number of the pair, of the point beside the terminal (-1: the UAV itself),
         and faces, of chains from a terminal."""
-        place, names = local[start].position, list(local)
+        position, names = local[start].position, list(local)
         ends = np.array([local[name].position for name in names])
         if self._depth > 1:
-            ends = np.concatenate([ends, place + ASIDE])
-        found = reflected(chains[start], self._mirrors, self._depth, place, ends)
+            ends = np.concatenate([ends, position + PROBES_M])
+        found = reflected(chains[start], self._mirrors, self._depth, position, ends)
         end = found[:, 0]
         beside = np.where(end < len(names), -1, end - len(names))
         end = np.where(end < len(names), end, names.index(start))
@@ -191,15 +191,15 @@ class Images:
         start, end = (_stacked(motion[pair, side]) for side in (0, 1))
         legs = unfold(normals, offsets, start, end)
         aside = beside >= 0
-        tip = end.position + np.where(aside[:, None], ASIDE[beside], 0.0)
+        tip = end.position + np.where(aside[:, None], PROBES_M[beside], 0.0)
         points = legs.points.copy()
         there = _stacked(motion[pair[aside], 1])
         there = replace(there, position=tip[aside])
         begin = _stacked(motion[pair[aside], 0])
         points[aside] = unfold(normals[aside], offsets[aside], begin, there).points
-        apart = np.linalg.norm(legs.points - points, axis=2).max(axis=1, initial=0.0)
+        distance = np.linalg.norm(legs.points - points, axis=2).max(axis=1, initial=0.0)
         stops = np.concatenate([start.position[:, None], points, tip[:, None]], axis=1)
-        keep = np.flatnonzero(apart < SLACK + STRETCH * legs.length)
+        keep = np.flatnonzero(distance < SLACK + STRETCH * legs.length)
         return _Candidates(pair[keep], faces[keep], normals[keep], legs.select(keep), stops[keep])
 
     def _clear(self, parts: list[_Candidates]) -> list[np.ndarray]:
@@ -245,11 +245,11 @@ def _stacked(motion: np.ndarray) -> Pose:
 
 
 def _lifted(stops: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Begins and ends (K, B + 1, 3) of the paths' segments, `LIFT` off the walls on the side where
-    the path is."""
+    """Return starts and ends (K, B + 1, 3) of the paths' segments, `RAY_OFFSET_M` off the walls on
+    the path's side."""
     lift = np.zeros_like(stops)
     side = np.sign(((stops[:, :-2] - stops[:, 1:-1]) * normals).sum(2))
-    lift[:, 1:-1] = LIFT * side[..., None] * normals
+    lift[:, 1:-1] = RAY_OFFSET_M * side[..., None] * normals
     return (stops + lift)[:, :-1], (stops + lift)[:, 1:]
 
 

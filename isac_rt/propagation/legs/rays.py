@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from isac_rt.propagation.legs.geometry import LIFT
+from isac_rt.propagation.legs.geometry import RAY_OFFSET_M
 
 CHUNK = 1 << 20
 
@@ -46,10 +46,10 @@ class Triangles:
         first: dict[int, int] = {0: 0}  # by the number of a shape; 0 is none
         for shape in scene.shapes():
             values = mi.traverse(shape)
-            place = np.asarray(values["vertex_positions"], np.float32).reshape(-1, 3)
+            positions = np.asarray(values["vertex_positions"], np.float32).reshape(-1, 3)
             number = int(np.asarray(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))).ravel()[0])
             first[number] = sum(map(len, parts))
-            parts.append(place[np.asarray(values["faces"], np.int64).reshape(-1, 3)])
+            parts.append(positions[np.asarray(values["faces"], np.int64).reshape(-1, 3)])
         self.corners = np.concatenate(parts)
         """(T, 3, 3) float32"""
         self._first = np.zeros(max(first) + 1, np.int64)
@@ -68,19 +68,18 @@ class Shadows:
     def __init__(self, scene: mi.Scene) -> None:
         self.scene = scene
 
-    def sees(self, place: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(N,) whether `place` sees points (N, 3) on surfaces with unit normals (N, 3) (of either
-        side)."""
+    def sees(self, position: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """(N,) bool: `position` sees points (N, 3) on surfaces with normals (N, 3), either side."""
         out = np.empty(len(points), bool)
         for first in range(0, len(points), CHUNK):
             part = slice(first, first + CHUNK)
-            span = place - points[part]
-            side = np.where((span * normals[part]).sum(1) < 0, -LIFT, LIFT)
+            span = position - points[part]
+            side = np.where((span * normals[part]).sum(1) < 0, -RAY_OFFSET_M, RAY_OFFSET_M)
             start = points[part] + side[:, None] * normals[part]
-            span = place - start
+            span = position - start
             length = np.linalg.norm(span, axis=1)
-            span /= np.maximum(length, LIFT)[:, None]
-            ray = rays(start, span, np.maximum(length - LIFT, 0.0))
+            span /= np.maximum(length, RAY_OFFSET_M)[:, None]
+            ray = rays(start, span, np.maximum(length - RAY_OFFSET_M, 0.0))
             out[part] = ~computed(self.scene.ray_test(ray))
         return out
 
@@ -89,11 +88,13 @@ class Shadows:
         """Return the triangles of the scene."""
         return Triangles(self.scene)
 
-    def ever_sees(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(N,) whether any of `places` (K, 3) `sees` points: each is tested until one does, in one
+    def ever_sees(
+        self, positions: np.ndarray, points: np.ndarray, normals: np.ndarray
+    ) -> np.ndarray:
+        """(N,) bool: any of `positions` (K, 3) `sees` points, each tested until one does, in one
         kernel."""
-        count = dr.opaque(mi.UInt32, len(places))  # else each number of places compiles anew
-        view, out = _columns(places), np.zeros(len(points), bool)
+        count = dr.opaque(mi.UInt32, len(positions))  # else each number of places compiles anew
+        view, out = _columns(positions), np.zeros(len(points), bool)
         for first in range(0, len(points), CHUNK):
             part = slice(first, first + CHUNK)
             facet = _columns(points[part], normals[part])
@@ -109,14 +110,16 @@ class Shadows:
             out[part] = ~computed(dark)
         return out
 
-    def all_seen(self, places: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(K, N) what each of `places` (K, 3) `sees`, many places in one kernel."""
+    def all_seen(
+        self, positions: np.ndarray, points: np.ndarray, normals: np.ndarray
+    ) -> np.ndarray:
+        """(K, N) what each of `positions` (K, 3) `sees`, many places in one kernel."""
         width = max(len(points), 1)
-        facet, out = _columns(points, normals), np.empty((len(places), len(points)), bool)
-        for first in range(0, len(places) if len(points) else 0, max(CHUNK // width, 1)):
+        facet, out = _columns(points, normals), np.empty((len(positions), len(points)), bool)
+        for first in range(0, len(positions) if len(points) else 0, max(CHUNK // width, 1)):
             part = slice(first, first + max(CHUNK // width, 1))
             some = out[part]
-            row, view = dr.arange(mi.UInt32, some.size), _columns(places[part])
+            row, view = dr.arange(mi.UInt32, some.size), _columns(positions[part])
             number = row // dr.opaque(mi.UInt32, width)
             at = [dr.gather(mi.Float64, axis, number) for axis in view]
             column = row - number * dr.opaque(mi.UInt32, width)
@@ -124,8 +127,8 @@ class Shadows:
             some[:] = ~computed(self._blocked(at, here)).reshape(some.shape)
         return out
 
-    def _blocked(self, place: list[mi.Float64], facet: list[mi.Float64]) -> mi.Bool:
-        return mi.Bool(self.scene.ray_test(_ray(place, facet)))
+    def _blocked(self, position: list[mi.Float64], facet: list[mi.Float64]) -> mi.Bool:
+        return mi.Bool(self.scene.ray_test(_ray(position, facet)))
 
     def clear(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """(N,) whether nothing stands between points (N, 3) and points (N, 3)."""
@@ -137,19 +140,19 @@ class Shadows:
         return ~computed(self.scene.ray_test(ray))
 
 
-def _ray(place: list[mi.Float64], facet: list[mi.Float64]) -> mi.Ray3f:
+def _ray(position: list[mi.Float64], facet: list[mi.Float64]) -> mi.Ray3f:
     """From a facet, its point, then its normal, to a place: line by line as `Shadows.sees` has it,
     so that both agree to the last bit."""
-    (x, y, z), (px, py, pz, nx, ny, nz) = place, facet
-    side = dr.select((x - px) * nx + (y - py) * ny + (z - pz) * nz < 0, -LIFT, LIFT)
+    (x, y, z), (px, py, pz, nx, ny, nz) = position, facet
+    side = dr.select((x - px) * nx + (y - py) * ny + (z - pz) * nz < 0, -RAY_OFFSET_M, RAY_OFFSET_M)
     sx, sy, sz = px + side * nx, py + side * ny, pz + side * nz
     dx, dy, dz = x - sx, y - sy, z - sz
     length = dr.sqrt(dx * dx + dy * dy + dz * dz)
-    size = dr.maximum(length, LIFT)
+    size = dr.maximum(length, RAY_OFFSET_M)
     ray = mi.Ray3f(
         mi.Point3f(mi.Float(sx), mi.Float(sy), mi.Float(sz)),
         mi.Vector3f(mi.Float(dx / size), mi.Float(dy / size), mi.Float(dz / size)),
     )
-    reach = mi.Float(dr.maximum(length - LIFT, 0.0))
+    reach = mi.Float(dr.maximum(length - RAY_OFFSET_M, 0.0))
     ray.maxt = reach  # type: ignore[assignment]  # stub: scalars
     return ray

@@ -22,10 +22,10 @@ def slab_coefficients(
         omega * VACUUM_PERMITTIVITY
     )
     root = np.sqrt(eta - (1 - cosine**2))
-    turn = np.exp(-4j * np.pi * material.thickness / wavelength * root)
+    phasor = np.exp(-4j * np.pi * material.thickness / wavelength * root)
     mirrored = 1.0 if whole else np.sqrt(1 - material.scattering_coefficient**2)
     te, tm = (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)
-    first, second = (mirrored * r * (1 - turn) / (1 - r**2 * turn) for r in (te, tm))
+    first, second = (mirrored * r * (1 - phasor) / (1 - r**2 * phasor) for r in (te, tm))
     return first, second
 
 

@@ -25,7 +25,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isac_rt.receive.joint.interaction import CLOSE, TANGENTS, Places, clusters, ignored, shared
+from isac_rt.receive.joint.interaction import (
+    CLOSE,
+    TANGENTS,
+    CellPositions,
+    clusters,
+    ignored,
+    shared,
+)
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.joint.tones import (
     PARAMETERS,
@@ -44,7 +51,7 @@ LARGEST_STEP = np.array([0.3, 0.3, 0.03, 0.03])
 """Of one iteration: cells, Doppler bins, direction cosines."""
 SETTLED = 0.05
 """A step under this share of the standard deviation ends the iteration."""
-AWAKE = 0.05
+MAX_DRIFT = 0.05
 """Of its deviations a settled path may be moved by what other paths' later steps leave."""
 
 
@@ -60,12 +67,12 @@ class Fit(NamedTuple):
     left: float
 
 
-def places(known: Known, paths: Sequence[JointPath]) -> Places:
+def cell_positions(known: Known, paths: Sequence[JointPath]) -> CellPositions:
     """Where paths lie among the cells of a frame."""
     delay, rate = (np.array([getattr(p, n) for p in paths]) for n in ("delay", "delay_rate"))
     beat = known.waveform.beat_cells(delay, rate, 0.0)
     direction = np.array([p.direction for p in paths]).reshape(-1, 2)
-    return Places(beat, rate / rate_bin(known.waveform), direction, delay)
+    return CellPositions(beat, rate / rate_bin(known.waveform), direction, delay)
 
 
 def match_chirps(moments: Moments, path: JointPath) -> np.ndarray:
@@ -122,7 +129,7 @@ class _Descent:
         self.weights = powers_of_time(known, 3)
         self.own = own_sums(float(known.waveform.num_samples), self.weights)
         self.tones, self.levers = Tones.of(known, self.paths)
-        where = places(known, self.paths)
+        where = cell_positions(known, self.paths)
         self.share = shared(known, where, where)[: self.free]
         np.fill_diagonal(self.share, 0)
         self.group = clusters(self.share[:, : self.free])
@@ -199,7 +206,7 @@ class _Descent:
             self._move(mine, share * steps)
         self.stirred[active] = 0
         self.stirred += TANGENTS * (self.share[:, : self.free] * self.felt[:, : self.free]) @ moved
-        return (moved > SETTLED) | (self.stirred > AWAKE)
+        return (moved > SETTLED) | (self.stirred > MAX_DRIFT)
 
     def _within_reach(self, mine: np.ndarray, steps: np.ndarray) -> float:
         """The share of a cluster's step that is taken: no farther than its paths reach, and half as
@@ -267,20 +274,20 @@ class _Descent:
         tones, free, num_tx = self.tones, self.free, amplitude.shape[1]
         shape = free, self.size, 4, num_tx, self.known.antennas.num_rx
         out = np.zeros(shape, complex)
-        turn = 2j * np.pi * amplitude[:free, None, :, None] * self.levers[:free]
+        factor = 2j * np.pi * amplitude[:free, None, :, None] * self.levers[:free]
         carrier = tones.middle[:free, None, None, None]
         for i in range(PARAMETERS):
             at = 1 if i == 1 else 0  # the delay rate moves the delay by t
-            out[:, i, at] = turn[:, i] * carrier[:, 0]
-            out[:, i, at + 2] = turn[:, i] * (tones.slope * tones.interval)
-        out[:, 1, 2] = turn[:, 1] * carrier[:, 0] * tones.interval
+            out[:, i, at] = factor[:, i] * carrier[:, 0]
+            out[:, i, at + 2] = factor[:, i] * (tones.slope * tones.interval)
+        out[:, 1, 2] = factor[:, 1] * carrier[:, 0] * tones.interval
         for i in range(self.count):
             mine = np.ones((num_tx, 1)) if self.count == 1 else np.arange(num_tx)[:, None] == i
             out[:, PARAMETERS + 2 * i, 0] = mine
             out[:, PARAMETERS + 2 * i + 1, 0] = 1j * mine
         return out
 
-    def _move(self, mine: np.ndarray, steps: np.ndarray) -> None:
+    def _move(self, mine: np.ndarray, moves: np.ndarray) -> None:
         """Let some paths take their steps. The phase turns by 128 cycles per cell of delay: the
         amplitude follows that turn, and not its tangent."""
         sent, late = self.own[0, 0, :, 0], self.own[0, 1, :, 0] / self.own[0, 0, :, 0]
@@ -288,12 +295,12 @@ class _Descent:
         levers[:, 1] *= late
         if self.count == 1:
             levers = (levers @ sent / sent.sum())[..., None]
-        change, pairs = steps[:, :PARAMETERS], steps[:, PARAMETERS:].reshape(len(mine), -1, 2)
+        change, pairs = moves[:, :PARAMETERS], moves[:, PARAMETERS:].reshape(len(mine), -1, 2)
         angle = 2 * np.pi * self.tones.middle[mine, None] * (change[:, None] @ levers)[:, 0]
         more = pairs @ np.array([1, 1j])
-        place = change * units(self.known)
+        moves = change * units(self.known)
         for i, k in enumerate(mine.tolist()):
-            path, move = self.paths[k], place[i]
+            path, move = self.paths[k], moves[i]
             amplitude = path.amplitude * (1 + 1j * angle[i]) + more[i]
             self.paths[k] = replace(
                 path,
@@ -369,12 +376,12 @@ def residual_channels(
     known, num = moments.known, len(found.paths)
     w, num_tx = known.waveform, known.antennas.num_tx
     # a bin is one turn per frame
-    turns = np.exp(-2j * np.pi * offsets[:, None, None] * known.sampled_times / w.frame_duration)
-    weights = Weights.by_antenna(known, turns)
+    back = np.exp(-2j * np.pi * offsets[:, None, None] * known.sampled_times / w.frame_duration)
+    weights = Weights.by_antenna(known, back)
     sent = np.array([mine.sum() for mine in known.sent_by]) * w.num_samples
     counts = (sent if known.passes == 1 else np.array([sent.sum()])) * known.antennas.num_rx
     power = np.array([(np.abs(p.amplitude) ** 2 * counts).sum() for p in found.paths])
-    share = shared(known, places(known, found.paths), places(known, beside))
+    share = shared(known, cell_positions(known, found.paths), cell_positions(known, beside))
     at, of = np.nonzero(~ignored(share, power / moments.noise))
     tones = Tones.of(known, [*found.paths, *beside])[0]
     left = moments.of(tones.select(slice(num, None)), weights)[:, 0]

@@ -27,7 +27,7 @@ MARGIN = 1.0
 """Cells and bins by which two paths may come nearer to each other while they are fitted."""
 
 
-class Places(NamedTuple):
+class CellPositions(NamedTuple):
     """Beat [cells], Doppler [bins] (K,), directions (K, 2) and delays [s] (K,) of paths."""
 
     cells: np.ndarray
@@ -36,7 +36,7 @@ class Places(NamedTuple):
     delay: np.ndarray
 
 
-def shared(known: Known, of: Places, at: Places) -> np.ndarray:
+def shared(known: Known, of: CellPositions, at: CellPositions) -> np.ndarray:
     """(A, B) most that unit tones at the places `at` (A) share with those `of` (B)."""
     w = known.waveform
     beat = _dirichlet(np.abs(at.cells[:, None] - of.cells), w.num_samples)
@@ -70,12 +70,12 @@ def _dirichlet(distance: np.ndarray, size: int) -> np.ndarray:
     return 1 / np.maximum(under, 1.0)
 
 
-def _waves(known: Known, places: Places) -> np.ndarray:
+def _waves(known: Known, positions: CellPositions) -> np.ndarray:
     """(K, 3, L_rx) the receivers' phases, and these times either coordinate of the receivers, each
     of unit norm."""
-    a, turn = known.antennas, -2j * np.pi * known.waveform.effective_carrier
-    radius = known.radius(places.delay)[:, None]
-    wave = np.exp(turn * element_delays(a.rx_positions, places.direction, radius)[0])
+    a, j_omega = known.antennas, -2j * np.pi * known.waveform.effective_carrier
+    radius = known.radius(positions.delay)[:, None]
+    wave = np.exp(j_omega * element_delays(a.rx_positions, positions.direction, radius)[0])
     levers = np.stack([np.ones(a.num_rx), *(a.rx_positions[:, [0, 2]].T)])
     levers -= levers.mean(axis=1, keepdims=True) * (np.arange(3) > 0)[:, None]
     levers /= np.maximum(np.linalg.norm(levers, axis=1, keepdims=True), 1e-30)

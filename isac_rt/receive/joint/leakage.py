@@ -27,7 +27,7 @@ ORDERS = 7
 """Powers of x that hold a pair's own delay: within 0.1 cell of the common one they leave 1e-7 of
 the coupling."""
 ITERATIONS = 3
-SEEN = 10.0
+MIN_COUPLING = 10.0
 """Energy of a pair's coupling over the noise, in the mean of all pairs, from which on it is taken
 out: below, its sidelobes are under the noise."""
 
@@ -49,12 +49,12 @@ def without_leakage(
     max_range : farthest range of the coupling [m], one way
     """
     cells = np.arange(0.0, max_range / known.range_cell + STEP / 2, STEP)
-    turns = 2j * np.pi * cells[:, None]
-    sums = _sums(samples, known, 0.0, lambda x: np.exp(turns * x[:, None]))
+    exponent = 2j * np.pi * cells[:, None]
+    sums = _sums(samples, known, 0.0, lambda x: np.exp(exponent * x[:, None]))
     counts = np.array([mine.sum() for mine in known.sent_by]) * known.waveform.num_samples
     energy = (np.abs(sums) ** 2 / counts[:, None, None]).sum(axis=(0, 1)) / noise
     best = int(energy.argmax())
-    if energy[best] < SEEN * known.channels:
+    if energy[best] < MIN_COUPLING * known.channels:
         return samples
     delay = cells[best] * known.waveform.delay_step
     amplitude, own = _fit(known, _sums(samples, known, delay, _powers))

@@ -73,13 +73,13 @@ class Moments:
         lanes = num_rx + -num_rx % LANES
         factor = np.zeros((lanes, size), np.complex64)
         factor[:, :length] = _weights(length, size)
-        turn = np.exp(2j * np.pi * (np.arange(size) * (length // 2) % size) / size)
-        turns = np.repeat(turn.astype(np.complex64)[:, None], lanes, axis=1)
+        phasor = np.exp(2j * np.pi * (np.arange(size) * (length // 2) % size) / size)
+        phasors = np.repeat(phasor.astype(np.complex64)[:, None], lanes, axis=1)
         padded = np.zeros((num_chirps, lanes, size), np.complex64)
         out = new_memory((num_groups, num_chirps, size, lanes))
         for group, made in zip(self._samples, out, strict=True):  # receivers in the place of chirps
             padded[:, :num_rx, :length] = group.swapaxes(0, 1)
-            transform(padded, factor, np.arange(size), made, turn=turns)
+            transform(padded, factor, np.arange(size), made, phasor=phasors)
         return out
 
     @cached_property
@@ -94,7 +94,7 @@ class Moments:
     def of(self, tones: Tones, weights: Weights) -> np.ndarray:
         """(K, 2, I, A, L_rx) sums of s n^q g_i T* of each tone, but for the data's phases, which
         are taken out, n from the chirp's middle."""
-        shape = len(tones.cycles), 2, len(weights.factors), weights.places, tones.delay.shape[1]
+        shape = len(tones.cycles), 2, len(weights.factors), weights.num_sums, tones.delay.shape[1]
         out, size = np.zeros(shape, complex), self._samples.shape[-1]
         late = size // 2 - (size - 1) / 2
         factors = weights.factors * self.known.phases.conj()
@@ -115,7 +115,7 @@ def _weights(length: int, size: int) -> np.ndarray:
 def _kernel() -> np.ndarray:
     """(STEPS, 4, TAPS) float32, the kernel and its three derivatives at the taps about a frequency,
     in the middle of each step from one grid point to the next."""
-    place = (np.arange(STEPS) + 0.5) / STEPS
+    position = (np.arange(STEPS) + 0.5) / STEPS
     out = np.empty((STEPS, 4, TAPS), np.float32)
     for j in range(TAPS):
 
@@ -125,7 +125,7 @@ def _kernel() -> np.ndarray:
 
         exact = Chebyshev.interpolate(kernel, 17, [0, 1])
         for order in range(4):
-            out[:, order, j] = exact.deriv(order)(place) if order else exact(place)
+            out[:, order, j] = exact.deriv(order)(position) if order else exact(position)
     return out
 
 
@@ -140,9 +140,9 @@ def fill_sums(
 ) -> None:
     """Fill `Moments.of` from the spectrum, (M, P, G, 2 lanes) real and imaginary parts in turn;
     `late` is the place of sample N // 2 from the middle, `kernel` see `_kernel`."""
-    data, t, (factors, place, _) = spectrum.view(np.complex64), tones, weights
+    data, t, (factors, sum_index, _) = spectrum.view(np.complex64), tones, weights
     (steps, _, taps), size = kernel.shape, data.shape[2]
-    group, chirp = np.indices(place.shape)[..., None]
+    group, chirp = np.indices(sum_index.shape)[..., None]
     for k, rx in np.ndindex(len(out), out.shape[4]):
         own, f = t.delay[k, rx], t.frequency[k]
         ramp = own * t.slope * t.interval
@@ -153,12 +153,12 @@ def fill_sums(
         values = table[..., 0, :] + x * (table[..., 1, :] + x / 2 * table[..., 2, :])
         slopes = table[..., 1, :] + x * (table[..., 2, :] + x / 2 * table[..., 3, :])
         near = data[group, chirp, (whole[..., None] - taps // 2 + 1 + np.arange(taps)) % size, rx]
-        turns = own * t.middle[k] - t.slope * own**2 / 2 + ramp * late + t.cycles[k] + f * late
-        turns = turns + (t.carrier[k] - t.middle[k]) * own
-        back = np.exp(-2j * np.pi * (turns % 1))
+        cycles = own * t.middle[k] - t.slope * own**2 / 2 + ramp * late + t.cycles[k] + f * late
+        cycles = cycles + (t.carrier[k] - t.middle[k]) * own
+        back = np.exp(-2j * np.pi * (cycles % 1))
         zeroth = (values * near).sum(axis=-1) * back
         first = 1j * size / (2 * np.pi) * (slopes * near).sum(axis=-1) * back + late * zeroth
         for a in range(out.shape[3]):
-            here = place == a
+            here = sum_index == a
             out[k, 0, :, a, rx] += factors[:, here] @ zeroth[here]
             out[k, 1, :, a, rx] += factors[:, here] @ first[here]

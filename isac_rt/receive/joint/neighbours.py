@@ -17,7 +17,7 @@ from scipy.special import gammainccinv
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.receive.arms import element_delays
-from isac_rt.receive.joint.fit import Fit, energy, fit, places, residual_channels
+from isac_rt.receive.joint.fit import Fit, cell_positions, energy, fit, residual_channels
 from isac_rt.receive.joint.interaction import clusters, shared
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.joint.tones import JointPath, rate_bin, units
@@ -28,7 +28,7 @@ MAX_PATHS = 12
 """Strongest detections that are fitted; the others keep their own estimates."""
 MAX_SEARCHED = 6
 """Strongest paths beside which others are looked for."""
-MAX_HIDDEN = 3
+MAX_NEIGHBOURS = 3
 """Further paths that are fitted in a frame."""
 FALSE_RATE = 1e-4
 """Chance that noise invents a path in one search."""
@@ -107,10 +107,10 @@ def _with_hidden(
     searched = np.flatnonzero(settled)[np.argsort(-power[settled], kind="stable")][:MAX_SEARCHED]
     stale, spent = set(searched.tolist()), 0
     best: dict[int, tuple[float, int, JointPath]] = {}
-    while spent < MAX_HIDDEN:
+    while spent < MAX_NEIGHBOURS:
         for k in stale:
             delays = PROBED_CELLS if k in probed else ()
-            if (one := _hidden(moments, found, [k], delays)) is not None:
+            if (one := _further_path(moments, found, [k], delays)) is not None:
                 best[k] = one
         stale = set()
         if not best:
@@ -158,7 +158,7 @@ def _joined(
 
 def _clusters(known: Known, paths: list[JointPath]) -> np.ndarray:
     """(K,) number of the cluster of each path."""
-    where = places(known, paths)
+    where = cell_positions(known, paths)
     return clusters(shared(known, where, where))
 
 
@@ -182,7 +182,7 @@ def separate(moments: Moments, reference: Detections) -> tuple[Detections, np.nd
     start = _path(known, reference, 0)
     one = fit(moments, [start])
     near = _near(known, one.paths[0], start)
-    found = _hidden(moments, one, [0], PROBED_CELLS) if near else None
+    found = _further_path(moments, one, [0], PROBED_CELLS) if near else None
     if found is None:
         return None
     trial = fit(moments, [*one.paths, found[2]], iterations=MOST_STEPS)
@@ -222,7 +222,7 @@ def _credible(known: Known, paths: list[JointPath], before: list[JointPath], bes
     return power[beside] * 10 ** (-WEAKEST_DB / 10) < power[-1] < power[beside] * 10
 
 
-def _hidden(
+def _further_path(
     moments: Moments, found: Fit, which: list[int], delays: tuple[float, ...] = ()
 ) -> tuple[float, int, JointPath] | None:
     """The surest path that the residual of a fit holds about some of its paths, with its power over
@@ -266,11 +266,11 @@ def _beams(known: Known, path: JointPath, channels: np.ndarray, grid: np.ndarray
     arrays for an echo; at a PT over the receivers, added over the transmit antennas. Normalised to
     what one beam of white noise holds per unit `noise`."""
     a, radius = known.antennas, known.radius(path.delay)
-    turn = 2j * np.pi * known.waveform.effective_carrier
+    j_omega = 2j * np.pi * known.waveform.effective_carrier
 
     def steer(positions: np.ndarray) -> np.ndarray:
         own = element_delays(positions, path.direction, radius)[0]
-        return np.exp(turn * (element_delays(positions, grid, radius)[0] - own))
+        return np.exp(j_omega * (element_delays(positions, grid, radius)[0] - own))
 
     beams = channels @ steer(a.rx_positions).conj().T  # (offset, L_tx, G)
     if known.passes == 2:

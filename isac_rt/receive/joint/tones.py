@@ -114,19 +114,22 @@ class Weights(NamedTuple):
     Attributes
     ----------
     factors : (I, M, P) complex, by which each chirp counts
-    place : (M, P) int, the sum to which it belongs, of `places`: its transmit antenna, or itself
-    places : A
+    sum_index : (M, P) int, the sum to which it belongs, of `num_sums`: its transmit antenna,
+        or itself
+    num_sums : A
     """
 
     factors: np.ndarray
-    place: np.ndarray
-    places: int
+    sum_index: np.ndarray
+    num_sums: int
 
     @classmethod
     def by_antenna(cls, known: Known, factors: np.ndarray) -> Weights:
         """One sum for the chirps of each transmit antenna."""
-        place = np.array(known.schedule, np.int64, order="C")  # one that may be written, as others
-        return cls(factors.astype(complex), place, known.antennas.num_tx)
+        sum_index = np.array(
+            known.schedule, np.int64, order="C"
+        )  # one that may be written, as others
+        return cls(factors.astype(complex), sum_index, known.antennas.num_tx)
 
     @classmethod
     def by_chirp(cls, known: Known) -> Weights:
@@ -145,7 +148,7 @@ def powers_of_time(known: Known, count: int) -> Weights:
 def cross_sums(tones: Tones, pairs: np.ndarray, weights: Weights, powers: int = 3) -> np.ndarray:
     """(Q, powers, I, A, L_rx) sums of n^q g_i T_j T_k*, for `pairs` (Q, 2) of k and j, n from the
     chirp's middle."""
-    shape = len(pairs), powers, len(weights.factors), weights.places, tones.delay.shape[1]
+    shape = len(pairs), powers, len(weights.factors), weights.num_sums, tones.delay.shape[1]
     out = np.empty(shape, complex)
     if len(pairs):
         fill_cross_sums(tones, np.asarray(pairs, np.int64), weights, out)
@@ -154,9 +157,9 @@ def cross_sums(tones: Tones, pairs: np.ndarray, weights: Weights, powers: int = 
 
 def own_sums(size: float, weights: Weights, powers: int = 3) -> np.ndarray:
     """(powers, I, A, 1) `cross_sums` of a tone with itself, for real factors."""
-    total = np.zeros((weights.places, len(weights.factors)))
+    total = np.zeros((weights.num_sums, len(weights.factors)))
     each = weights.factors.real.reshape(len(weights.factors), -1)
-    np.add.at(total, weights.place.ravel(), each.T)
+    np.add.at(total, weights.sum_index.ravel(), each.T)
     over = np.array([size, 0.0, size * (size**2 - 1) / 12])[:powers]
     return over[:, None, None, None] * total.T[..., None]
 
@@ -169,15 +172,15 @@ def fill_cross_sums(tones: Tones, pairs: np.ndarray, weights: Weights, out: np.n
     n = np.arange(size) - (size - 1) / 2
     powers = n ** np.arange(out.shape[1])[:, None]
     for s, (k, j) in enumerate(pairs):
-        turns, frequency = t.cycles[j] - t.cycles[k], t.frequency[j] - t.frequency[k]
+        cycles, frequency = t.cycles[j] - t.cycles[k], t.frequency[j] - t.frequency[k]
         wobble = t.carrier[k] - t.middle[k]
         for rx in range(out.shape[4]):
             mine, other = t.delay[k, rx], t.delay[j, rx]
             own = other * t.middle[j] - mine * t.middle[k] - t.slope * (other**2 - mine**2) / 2
-            phase = turns + own + (other - mine) * wobble
+            phase = cycles + own + (other - mine) * wobble
             beat = frequency + (other - mine) * t.slope * t.interval
             chirps = np.exp(2j * np.pi * beat[..., None] * n) @ powers.T  # (M, P, powers)
             chirps = chirps * np.exp(2j * np.pi * (phase % 1))[..., None]
-            for a in range(weights.places):
-                here = weights.place == a
+            for a in range(weights.num_sums):
+                here = weights.sum_index == a
                 out[s, :, :, a, rx] = chirps[here].T @ weights.factors[:, here].T

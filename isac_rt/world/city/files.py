@@ -121,7 +121,7 @@ def beside(path: Path, name: str, what: str) -> Path:
         relative = os.path.relpath(path.parent / relative, path.parent)
     file, steps = path.parent / relative, relative.split(os.sep)
     inside = steps[0] != os.pardir
-    if inside and any(os.path.islink(place) for place in (file, *file.parents[: len(steps) - 1])):
+    if inside and any(os.path.islink(part) for part in (file, *file.parents[: len(steps) - 1])):
         inside = Path(os.path.realpath(file)).is_relative_to(os.path.realpath(path.parent))
     if not inside:
         raise CityError(f"{path.name}: {what} wants {name}, outside its folder; copy it there")
@@ -146,5 +146,5 @@ def parsed(data: bytes, model: type[Document], name: str, remedy: str) -> Docume
 def first_error(error: ValidationError) -> str:
     """The first place that is not as it should be, and why."""
     first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-    place = " ".join(str(part) for part in first["loc"])
-    return f"{place}: {first['msg']}"
+    key = " ".join(str(part) for part in first["loc"])
+    return f"{key}: {first['msg']}"

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from isac_rt.kernels import world_mesh
 from isac_rt.kernels.jit import twin_of
 from isac_rt.storage import kept
+from isac_rt.world.city.georeference import GeoReference
 from isac_rt.world.city.heights import HIGHEST_M
 from isac_rt.world.city.materials import CityError, Material, MaterialUse
-from isac_rt.world.city.place import Place
 
 _LOG = logging.getLogger(__name__)
 PLANE_TOLERANCE = 1e-6
 """Two faces share a plane if all corners of one lie this close to the plane of the other. [m]"""
-FACES_KEPT = 3000
+MIN_CACHED_FACES = 3000
 """The planes of fewer faces are found in less time than it takes to read them."""
 MAX_FACES = 10_000_000
 SMALLEST_M = 2.0
@@ -73,7 +73,7 @@ class CityMesh:
         Faces that `within` cut away.
     reach : float
         Distance from the origin beyond which faces matter to nothing [m].
-    place : Place or None
+    georeference : Place or None
         Where it lies on Earth, of cities from maps.
     doubts : tuple of str
         Questions to the user: what looks as if it were meant otherwise.
@@ -89,7 +89,7 @@ class CityMesh:
     plane_tolerance: float = PLANE_TOLERANCE
     num_beyond: int = 0
     reach: float = np.inf
-    place: Place | None = None
+    georeference: GeoReference | None = None
     doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -151,7 +151,7 @@ class CityMesh:
         """
         if not self.num_faces:
             return _read_only(np.zeros(0, dtype=np.int64))
-        if self.num_faces < FACES_KEPT:
+        if self.num_faces < MIN_CACHED_FACES:
             return _read_only(self._planes())
         depends_on = [self.vertices, self.faces, self.plane_tolerance]
         return _read_only(kept("planes", depends_on, self._planes))
@@ -188,8 +188,11 @@ class CityMesh:
         x_max, y_max) in world coordinates [m]; this very city if there are none."""
         if not len(areas):
             return self
-        places = self.corners[..., :2] + self.origin[:2]
-        out = [((places > a[:2]) & (places < a[2:])).all(axis=(1, 2)) for a in map(np.array, areas)]
+        positions = self.corners[..., :2] + self.origin[:2]
+        out = [
+            ((positions > a[:2]) & (positions < a[2:])).all(axis=(1, 2))
+            for a in map(np.array, areas)
+        ]
         return self.of(~np.any(out, axis=0))
 
     def of(self, some: NDArray[np.bool_]) -> CityMesh:
@@ -208,12 +211,12 @@ class CityMesh:
     def record(self) -> dict[str, Any]:
         """Return the record of a city for people and other programs: its name, where it lies, what
         was assumed."""
-        place = self.place
+        geo = self.georeference
         return {
             "name": self.name,
-            "crs": (place and place.crs) or None,
-            "origin": None if place is None else list(place.origin),
-            "plane": (place and place.plane) or None,
+            "crs": (geo and geo.crs) or None,
+            "origin": None if geo is None else list(geo.origin),
+            "plane": (geo and geo.plane) or None,
             "notes": list(self.notes),
         }
 

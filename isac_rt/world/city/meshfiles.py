@@ -20,9 +20,9 @@ from pydantic_core import from_json
 
 from isac_rt.world import settings
 from isac_rt.world.city.files import beside, read_bytes
+from isac_rt.world.city.georeference import GeoReference
 from isac_rt.world.city.materials import CityError, MaterialUse, canonical_name, material_within
 from isac_rt.world.city.mesh import MAX_FACES, Surface, gathered
-from isac_rt.world.city.place import Place
 
 logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else it prints tracebacks
 _MAX_PROPERTIES = 200
@@ -252,8 +252,8 @@ def _scene(path: Path) -> Iterator[Piece]:
             raise ValueError(f"node {number} hangs from two nodes")
         seen.add(number)
         node = tree["nodes"][number]
-        place = above @ _to_parent(node)
-        left += [(place, child) for child in node.get("children", [])]
+        to_world = above @ _to_parent(node)
+        left += [(to_world, child) for child in node.get("children", [])]
         mesh = tree["meshes"][node["mesh"]] if "mesh" in node else {"primitives": []}
         for primitive in mesh["primitives"]:
             mode = primitive.get("mode", _TRIANGLES)
@@ -268,7 +268,7 @@ def _scene(path: Path) -> Iterator[Piece]:
             labels = (node.get("name", str(number)), mesh.get("name"), of.get("name"))
             faces = _triangles(corners, mode)
             piece = _used(points, faces, labels, path.name)
-            yield replace(piece, vertices=piece.vertices @ place[:3, :3].T + place[:3, 3])
+            yield replace(piece, vertices=piece.vertices @ to_world[:3, :3].T + to_world[:3, 3])
 
 
 _READERS: dict[str, Callable[[Path], Iterator[Piece]]] = {
@@ -346,10 +346,10 @@ def _is_y_up(city: settings.City, path: Path) -> bool:
     return city.up_axis == "y" or (city.up_axis == "auto" and path.suffix.lower() in _Y_UP)
 
 
-def mesh_place(city: settings.City, path: Path) -> Place | None:
+def mesh_georeference(city: settings.City, path: Path) -> GeoReference | None:
     """Return the relation of a mesh file to the world; None where it is no plain shift."""
     plain = city.origin is not None and city.scale == 1 and not _is_y_up(city, path)
-    return Place("", city.origin) if plain and city.origin else None
+    return GeoReference("", city.origin) if plain and city.origin else None
 
 
 def point_in_file(
@@ -362,7 +362,7 @@ def point_in_file(
 
 def mesh_file(
     city: settings.City, path: Path
-) -> tuple[list[Surface], list[str], Place | None, bool]:
+) -> tuple[list[Surface], list[str], GeoReference | None, bool]:
     """The surfaces of a mesh file in world coordinates: node transforms applied, then taken from
     `city.origin`, scaled, and turned z-up; with notes, the place of the origin, and whether z is up
     by assumption.
@@ -404,4 +404,4 @@ def mesh_file(
         notes.append(f"{said}: {_listed(guessed, 'pieces')}")
     if gltf and not y_up:
         notes.append("glTF is y-up by its standard, and city.up_axis is z")
-    return found, notes, mesh_place(city, path), city.up_axis == "auto" and not gltf
+    return found, notes, mesh_georeference(city, path), city.up_axis == "auto" and not gltf

@@ -157,13 +157,13 @@ def transform_of(reader: _Reader, shape: ET.Element) -> NDArray[np.float64]:
 def _placed(
     reader: _Reader,
     parent: ET.Element,
-    place: NDArray[np.float64],
+    to_world: NDArray[np.float64],
     groups: dict[str, ET.Element] | None,
 ) -> Iterator[tuple[ET.Element, NDArray[np.float64]]]:
     """Yield the shapes under an element with their transforms (4, 4), those of one of the `groups`
     once for each instance; None: within a group, which holds no instance."""
     for shape in parent.findall("shape"):
-        kind, own = shape.get("type"), place @ transform_of(reader, shape)
+        kind, own = shape.get("type"), to_world @ transform_of(reader, shape)
         if kind == "instance" and groups is not None:
             keys = [reader.text(ref, "id") or "" for ref in shape.findall("ref")]
             named = [*shape.findall("shape"), *(groups[key] for key in keys if key in groups)]

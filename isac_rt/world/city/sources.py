@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike
 from isac_rt.registry import CITY_SOURCES, extension
 from isac_rt.world import settings
 from isac_rt.world.city.files import missing_extra, needs_extra
+from isac_rt.world.city.georeference import GeoReference
 from isac_rt.world.city.materials import CityError, resolve_materials
 from isac_rt.world.city.mesh import CityMesh, Surface, check_size, clean, empty_city
-from isac_rt.world.city.meshfiles import mesh_file, mesh_files, mesh_place
+from isac_rt.world.city.meshfiles import mesh_file, mesh_files, mesh_georeference
 from isac_rt.world.city.mitsuba_xml import builtin_path, mitsuba_file, mitsuba_files
-from isac_rt.world.city.place import Place
 
 
 def _path(city: settings.City, folder: Path) -> Path:
@@ -80,14 +80,14 @@ class CityParts:
     name : of the city
     surfaces : in world coordinates, not yet cleaned
     notes : what was left out or assumed, for the report
-    place : where on Earth the city's origin lies; None where the source does not say
+    georeference : where on Earth the city's origin lies; None where the source does not say
     may_lie : on its side, for the source does not say which axis is up
     """
 
     name: str
     surfaces: list[Surface]
     notes: list[str] = field(default_factory=list)
-    place: Place | None = None
+    georeference: GeoReference | None = None
     may_lie: bool = False
 
 
@@ -141,7 +141,7 @@ def mitsuba(city: settings.City, folder: Path) -> CityParts:
 builtin = mitsuba
 
 
-def city_place(city: settings.City, folder: Path) -> Place | None:
+def city_georeference(city: settings.City, folder: Path) -> GeoReference | None:
     """Where a city from a file lies, without building it; None where it does not say.
 
     Raises
@@ -149,12 +149,12 @@ def city_place(city: settings.City, folder: Path) -> Place | None:
     CityError
     """
     if city.source == "mesh":
-        return mesh_place(city, _path(city, folder))
+        return mesh_georeference(city, _path(city, folder))
     if city.source != "footprints":
         return None
     path = _path(city, folder)
-    place: Place = _map_reader("map_place", path)(city, path, [], [])[1]
-    return place
+    georeference: GeoReference = _map_reader("map_georeference", path)(city, path, [], [])[1]
+    return georeference
 
 
 def load_city(
@@ -209,6 +209,6 @@ def load_city(
         tuple(counted),
         tolerance,
         reach=city.keep_radius_m or np.inf,
-        place=parts.place,
+        georeference=parts.georeference,
         doubts=tuple(check_size(vertices[faces], parts.name, parts.may_lie)),
     )

@@ -231,7 +231,7 @@ def test_expected_count_is_that_of_a_fine_scan():
     u = np.zeros((513, 3))
     u[:, 0] = np.linspace(-1, 1, 513) * np.sin(ANTENNAS.half_view)
     k = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT
-    length = 2 * np.sin(ANTENNAS.half_view) * k * channels.places[:, 0].std()
+    length = 2 * np.sin(ANTENNAS.half_view) * k * channels.positions[:, 0].std()
     fine = channels.steering(u, silent(w, ANTENNAS))
     x = rng.standard_normal((draws, 16, 2)) @ np.array([1, 1j]) / np.sqrt(2)
     above = np.concatenate(
@@ -286,8 +286,8 @@ def test_size_of_the_scanned_directions():
     w, antennas = Waveform(), replace(ANTENNAS, rx_x=3, rx_z=4)
     channels = all_channels(antennas)
     x, z = (
-        channels.places[:, 0] - channels.places[:, 0].mean(),
-        channels.places[:, 2] - channels.places[:, 2].mean(),
+        channels.positions[:, 0] - channels.positions[:, 0].mean(),
+        channels.positions[:, 2] - channels.positions[:, 2].mean(),
     )
     k = 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT
     side = 2 * np.pi / (k * antennas.spacing)  # what the elements tell apart is all in view
@@ -305,8 +305,8 @@ def test_direction_within_a_filters_beam():
     w, antennas = Waveform(), replace(ANTENNAS, rx_x=6, rx_z=5)
     u, k = np.array([0.37, -0.21]), 2 * np.pi * w.effective_carrier / SPEED_OF_LIGHT
     wave = [
-        np.exp(-1j * k * (places[:, [0, 2]] @ u))
-        for places in (antennas.tx_positions, antennas.rx_positions)
+        np.exp(-1j * k * (positions[:, [0, 2]] @ u))
+        for positions in (antennas.tx_positions, antennas.rx_positions)
     ]
     estimate = Estimate(1e-7, 1e-8, 2.3j * np.outer(*wave))
     size = len(all_channels(antennas))
@@ -396,7 +396,7 @@ def test_a_mesh_detector_without_a_mesh_says_so():
         )
 
 
-STRAIGHT, ASIDE = (0.3, 0.0), (-0.2, 0.3)
+STRAIGHT, PROBES_M = (0.3, 0.0), (-0.2, 0.3)
 
 
 @pytest.mark.parametrize(
@@ -404,8 +404,8 @@ STRAIGHT, ASIDE = (0.3, 0.0), (-0.2, 0.3)
     [
         ((STRAIGHT, STRAIGHT), 0.0, False, True),
         ((STRAIGHT, STRAIGHT), 0.2, False, True),
-        ((STRAIGHT, ASIDE), 0.0, False, False),
-        ((STRAIGHT, ASIDE), 0.0, True, True),
+        ((STRAIGHT, PROBES_M), 0.0, False, False),
+        ((STRAIGHT, PROBES_M), 0.0, True, True),
     ],
     ids=["straight", "beside a wall", "over a wall", "in clutter"],
 )
@@ -419,7 +419,9 @@ def test_an_echo_over_a_wall_on_one_way_starts_no_track(ways, beside, clutter, s
     sent = known(w, schedule, payload, ANTENNAS)
     there, back = ways
     paths = [Path(60.0, 9.0, 0.5, there, back), Path(60.0, 9.0, 0.5, back, there)]
-    paths += [Path(60.0, 9.0, np.sqrt(beside), ASIDE, ASIDE)]  # the straight ones add up to one
+    paths += [
+        Path(60.0, 9.0, np.sqrt(beside), PROBES_M, PROBES_M)
+    ]  # the straight ones add up to one
     spectra = clean_spectrum(cube(w, schedule, payload, paths, ANTENNAS, noise=1.0, seed=5), sent)
     guess = expected([Path(60.0, 9.0, 0.05, (0.1, -0.1), (0.1, -0.1))])
     guess = guess if clutter else guess.select(np.zeros(1, bool))

@@ -338,5 +338,5 @@ def test_the_simulated_board_explains_the_measured(tmp_path):
     whole, three, *without, ideal = unexplained_by(capture, found, sets)
     assert whole < -60 and three < -40 and ideal > -1
     assert min(without) > three + 10
-    with pytest.raises(CaptureError, match="places of the elements are unknown"):
+    with pytest.raises(CaptureError, match="positions of the elements are unknown"):
         unexplained_by(replace(capture, antennas=None), found, sets)

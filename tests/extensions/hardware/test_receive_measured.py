@@ -81,7 +81,7 @@ def test_places_are_needed_for_directions(tmp_path):
     write_ti(tmp_path / "b.mat", channels()[0], 61.3)
     capture = import_file(tmp_path / "b.mat")
     for asked in (lambda: sense(capture, Receivers()), lambda: range_azimuth(capture, None, 9.0)):
-        with pytest.raises(CaptureError, match="places of the elements are unknown"):
+        with pytest.raises(CaptureError, match="positions of the elements are unknown"):
             asked()
 
 

@@ -32,7 +32,7 @@ _WHOLE_M = 100.0
 
 
 @dataclass(frozen=True)
-class Place:
+class GeoReference:
     """Relation between world coordinates and those of a city's file.
 
     Parameters
@@ -173,13 +173,13 @@ def crs_name(text: str) -> str | None:
         return None
 
 
-def place_of(
+def georeference_of(
     boxes: NDArray[np.float64],
     crs: str,
     coordinates: str,
     origin: Sequence[float] | None,
     name: str,
-) -> Place:
+) -> GeoReference:
     """Where a city lies.
 
     Parameters
@@ -204,9 +204,9 @@ def place_of(
     elif coordinates == "metres":
         crs = ""
     elif not crs:
-        return Place("", _three(origin or (0.0, 0.0)))
+        return GeoReference("", _three(origin or (0.0, 0.0)))
     if not crs:
-        return Place("", _three(origin or (0.0, 0.0)))
+        return GeoReference("", _three(origin or (0.0, 0.0)))
     if _is_geographic(crs):
         _check_degrees(boxes, name)
     middle = (boxes[:, :2].min(axis=0) + boxes[:, 2:].max(axis=0)) / 2
@@ -222,8 +222,8 @@ def place_of(
             f"{name}: {x:.10g}, {y:.10g} lies outside of {crs}; correct city.crs or city.origin"
         )
     if metric:
-        return Place(crs, _three(origin or (0.0, 0.0)))
-    return Place(crs, (x, y, z), plane_about(lon, lat))
+        return GeoReference(crs, _three(origin or (0.0, 0.0)))
+    return GeoReference(crs, (x, y, z), plane_about(lon, lat))
 
 
 def _three(numbers: Sequence[float]) -> tuple[float, float, float]:
@@ -271,11 +271,13 @@ def _check_degrees(boxes: NDArray[np.float64], name: str) -> None:
         )
 
 
-def local_origin(place: Place, point: NDArray[np.float64]) -> tuple[float, float, float]:
+def local_origin(
+    georeference: GeoReference, point: NDArray[np.float64]
+) -> tuple[float, float, float]:
     """An origin near a world point (3,) in coordinates of the file: in a grid at whole hundreds of
     metres, so that people can add it."""
-    found = place.to_file(point[None])[0]
-    if place.is_lonlat:
+    found = georeference.to_file(point[None])[0]
+    if georeference.is_lonlat:
         return round(float(found[0]), 7), round(float(found[1]), 7), round(float(found[2]))
     x, y = np.round(found[:2] / _WHOLE_M) * _WHOLE_M
     return float(x), float(y), round(float(found[2]))
