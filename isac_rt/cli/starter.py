@@ -21,9 +21,9 @@ from isac_rt.scenario.swarm import unfolded
 from isac_rt.scenario.tree import json_schema
 from isac_rt.storage import write_whole
 from isac_rt.world.city import CityMesh, load_city
+from isac_rt.world.city.georeference import GeoReference, local_origin, plane_about
 from isac_rt.world.city.meshfiles import MESHES, point_in_file
 from isac_rt.world.city.mitsuba_xml import builtin_path
-from isac_rt.world.city.place import GeoReference, local_origin, plane_about
 from isac_rt.world.settings import City
 
 SCHEMA = "scenario.schema.json"
@@ -125,7 +125,7 @@ def _swarm_text(swarm: dict[str, dict[str, Any]], site: Site) -> str:
 
     def at_site(key: str, value: Any) -> Any:
         if key == "position_m":
-            return site.georeference(np.array([value], float))[0].round(1).tolist()
+            return site.place(np.array([value], float))[0].round(1).tolist()
         if key in ("velocity_mps", "boresight"):
             return (site.rotate(np.array([value], float))[0].round(3) + 0.0).tolist()
         if key == "waypoints":

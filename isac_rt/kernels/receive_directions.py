@@ -16,7 +16,7 @@ TABLE_STEPS = 32
 """Entries per cell of the tables of responses."""
 LEAST_WEIGHT = 1e-3
 """Scatterers weaker in a cell than this share of the noise are left out of its covariance."""
-CELLS_PER_BATCH = 8
+TOGETHER = 8
 """Scatterers that are added to a covariance at once."""
 
 
@@ -59,20 +59,16 @@ def line_bounds(maps, channels, spectra, out):
 
 
 @jit(fast=True)
-def search_directions(along_x, along_z, phasors_z, phasors_x, inside, scale, peak, index):
+def search_directions(along_x, along_z, turns_z, turns_x, inside, scale, peak, place):
     """`isac_rt.receive.directions.search_directions`, sixteen directions at once."""
     looks, count, lines, size = along_x.shape[1], along_x.shape[3], *along_z.shape[2:]
-    phasors, each, power = (
-        phasors_z.reshape(-1),
-        scale.reshape(-1),
-        np.empty(count * size, np.float32),
-    )
+    turns, each, power = turns_z.reshape(-1), scale.reshape(-1), np.empty(count * size, np.float32)
     channels_read, zero = np.empty(looks * 2 * lines * size, np.float32), splat(np.float32(0))
-    sine, line = phasors_z.shape[1] * size, 2 * lines * size
+    sine, line = turns_z.shape[1] * size, 2 * lines * size
     for s in range(along_x.shape[0]):
         norm = min(s, scale.shape[0] - 1) * power.size
         for t in range(looks):
-            _split_complex(along_z[s, t], channels_read[t * line : (t + 1) * line])
+            _apart(along_z[s, t], channels_read[t * line : (t + 1) * line])
         for i in range(count):
             for j in range(0, size, LANES):
                 total = zero
@@ -80,10 +76,10 @@ def search_directions(along_x, along_z, phasors_z, phasors_x, inside, scale, pea
                     re, im = zero, zero
                     for k in range(along_x.shape[2]):
                         a, b = splat(along_x[s, t, k, i].real), splat(along_x[s, t, k, i].imag)
-                        c, d = load(phasors, k * size + j), load(phasors, sine + k * size + j)
+                        c, d = load(turns, k * size + j), load(turns, sine + k * size + j)
                         re, im = re + a * c - b * d, im + a * d + b * c
                     for k in range(lines):
-                        a, b = splat(phasors_x[0, k, i]), splat(phasors_x[1, k, i])
+                        a, b = splat(turns_x[0, k, i]), splat(turns_x[1, k, i])
                         at = t * line + k * size + j
                         c, d = load(channels_read, at), load(channels_read, at + lines * size)
                         re, im = re + a * c - b * d, im + a * d + b * c
@@ -94,13 +90,13 @@ def search_directions(along_x, along_z, phasors_z, phasors_x, inside, scale, pea
         peak[s] = power[best]
         for axis, step in enumerate((size, 1)):
             at = best // size if axis == 0 else best % size
-            index[s, axis] = at
+            place[s, axis] = at
             if 0 < at < (count if axis == 0 else size) - 1:
-                _between(power[best - step], power[best], power[best + step], s, axis, peak, index)
+                _between(power[best - step], power[best], power[best + step], s, axis, peak, place)
 
 
 @jit(borrows=True)
-def _split_complex(lines, out):
+def _apart(lines, out):
     """All real parts of the lines, then all imaginary ones."""
     count, size = lines.shape
     for k in range(count):
@@ -125,14 +121,14 @@ def _largest(power, inside):
 
 
 @jit(fast=True, inline=True)
-def _between(before, middle, after, s, axis, peak, index):
+def _between(before, middle, after, s, axis, peak, place):
     """Vertex of the parabola through the logarithms of three neighbours."""
     low = np.log(max(before, np.float32(1e-20)) / middle)
     high = np.log(max(after, np.float32(1e-20)) / middle)
     curve = low + high
     if curve < 0:
         offset = min(max(np.float32(0.5) * (low - high) / curve, np.float32(-0.5)), np.float32(0.5))
-        index[s, axis] += offset
+        place[s, axis] += offset
         peak[s] *= np.exp(
             np.float32(0.5) * (high - low) * offset + np.float32(0.5) * curve * offset * offset
         )
@@ -145,13 +141,13 @@ class Axis(NamedTuple):
     ----------
     ends : (lines + 1,) where the channels of each line begin and end
     cosines, sines : (G, n) of exp(+j k v u) along the lines
-    phasors : (2, lines, H), the same of the lines' places on the other axis
+    turns : (2, lines, H), the same of the lines' places on the other axis
     """
 
     ends: np.ndarray
     cosines: np.ndarray
     sines: np.ndarray
-    phasors: np.ndarray
+    turns: np.ndarray
 
 
 @jit(fast=True)
@@ -170,7 +166,7 @@ def quadratic_forms(matrices, order, x, z, out):
     far = np.empty((2, x.ends.size - 1, high, num_z), np.float32)
     for p in range(x.ends.size - 1):
         for j in range(high):
-            c, d = x.phasors[0, p, j], x.phasors[1, p, j]
+            c, d = x.turns[0, p, j], x.turns[1, p, j]
             for n in range(num_z):
                 far[0, p, j, n] = c * z.cosines[j, n] + d * z.sines[j, n]
                 far[1, p, j, n] = d * z.cosines[j, n] - c * z.sines[j, n]
@@ -188,7 +184,7 @@ def quadratic_forms(matrices, order, x, z, out):
         for i in range(wide):
             for p in range(x.ends.size - 1):
                 for r in range(z.ends.size - 1):
-                    c, d = splat(two * z.phasors[0, r, i]), splat(two * z.phasors[1, r, i])
+                    c, d = splat(two * z.turns[0, r, i]), splat(two * z.turns[1, r, i])
                     for n in range(z.ends[r], z.ends[r + 1]):
                         re, im = _sum(channels_read, count, num_x + n, x, p, 0, i)
                         store(near, n * pair, re * c + im * d)
@@ -231,9 +227,9 @@ def _within(channels_read, count, begin, lines, total, step, other):
                     a, b = _sum(channels_read, count, begin + n, lines, p, begin, g)
                     c, d = splat(lines.cosines[g, n]), splat(lines.sines[g, n])
                     re, im = re + a * c + b * d, im + b * c - a * d
-                for h in range(lines.phasors.shape[2]):
-                    a, b = lines.phasors[0, p, h], lines.phasors[1, p, h]
-                    c, d = lines.phasors[0, q, h], lines.phasors[1, q, h]
+                for h in range(lines.turns.shape[2]):
+                    a, b = lines.turns[0, p, h], lines.turns[1, p, h]
+                    c, d = lines.turns[0, q, h], lines.turns[1, q, h]
                     at = (g * step + h * other) * LANES
                     turned = re * splat(a * c + b * d) - im * splat(b * c - a * d)
                     store(total, at, load(total, at) + turned)
@@ -241,7 +237,7 @@ def _within(channels_read, count, begin, lines, total, step, other):
 
 @jit(fast=True)
 def covariances(cells, scatterers, tables, shape, out):
-    """`covariance.fill_covariances` of the city receivers by `CELLS_PER_BATCH` scatterers."""
+    """`covariance.fill_covariances` of the city receivers, `TOGETHER` scatterers at a time."""
     rows, bins, num_bins = cells
     start, beat, doppler, power, steer = scatterers
     size = steer.shape[1]
@@ -254,10 +250,7 @@ def covariances(cells, scatterers, tables, shape, out):
             if k % TABLE_STEPS == TABLE_STEPS // 2:  # between two cells
                 most[axis, cell - 1] = max(most[axis, cell - 1], tables[axis][k])
     # what lies beyond the channels stays zero
-    re, im = (
-        np.zeros(CELLS_PER_BATCH * width, np.float32),
-        np.zeros(CELLS_PER_BATCH * width, np.float32),
-    )
+    re, im = np.zeros(TOGETHER * width, np.float32), np.zeros(TOGETHER * width, np.float32)
     sums = np.zeros((2, size, width), np.float32)
     for c in range(rows.size):
         sums[:], count = 0.0, 0
@@ -281,7 +274,7 @@ def covariances(cells, scatterers, tables, shape, out):
                         re[count * width + k] = steer[s, k].real * root
                         im[count * width + k] = steer[s, k].imag * root
                     count += 1
-                    if count == CELLS_PER_BATCH:
+                    if count == TOGETHER:
                         _add_products(re, im, count, size, sums)
                         count = 0
         _add_products(re, im, count, size, sums)

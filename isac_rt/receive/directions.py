@@ -26,7 +26,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from isac_rt.frame.antennas import SAME_PLACE_M, Antennas, aperture_of, folded
+from isac_rt.frame.antennas import SAME_POSITION_M, Antennas, aperture_of, folded
 from isac_rt.kernels import hermitian, receive_directions
 from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.receive_directions import Axis
@@ -55,24 +55,24 @@ class Lines:
     ----------
     members : of each line the numbers of its channels
     spectra : of each line (G, n) complex64, exp(+j k v u) along it
-    phasors : (lines, H) complex64, exp(+j k v u) of its place on the other axis
+    turns : (lines, H) complex64, exp(+j k v u) of its place on the other axis
     """
 
     members: tuple[np.ndarray, ...]
     spectra: tuple[np.ndarray, ...]
-    phasors: np.ndarray
+    turns: np.ndarray
 
     @classmethod
     def of(
-        cls, positions: np.ndarray, number: np.ndarray, u: tuple[np.ndarray, np.ndarray], axis: int
+        cls, places: np.ndarray, number: np.ndarray, u: tuple[np.ndarray, np.ndarray], axis: int
     ) -> Lines:
-        """The lines along an axis of channels at `positions` (L, 2) [rad per unit cosine], each in
+        """The lines along an axis of channels at `places` (L, 2) [rad per unit cosine], each in
         the line of its `number`, -1: in none."""
         members = tuple(np.flatnonzero(number == n) for n in np.unique(number[number >= 0]))
-        spectra = [np.exp(1j * np.outer(u[axis], positions[m, axis])) for m in members]
-        other = np.array([positions[m[0], 1 - axis] for m in members])
-        phasors = np.exp(1j * np.outer(other, u[1 - axis])).astype(np.complex64)
-        return cls(members, tuple(s.astype(np.complex64) for s in spectra), phasors)
+        spectra = [np.exp(1j * np.outer(u[axis], places[m, axis])) for m in members]
+        other = np.array([places[m[0], 1 - axis] for m in members])
+        turns = np.exp(1j * np.outer(other, u[1 - axis])).astype(np.complex64)
+        return cls(members, tuple(s.astype(np.complex64) for s in spectra), turns)
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Search:
     along_x, along_z : Lines
     inside : (G, H) bool, directions (u_x, u_z) of the unit disc
     wavenumber : [rad/m]
-    phasors : (2,) of `Antennas.turns`
+    turns : (2,) of `Antennas.turns`
     beam : (2,) resolution, 0 on an axis that the channels do not observe
     """
 
@@ -97,29 +97,29 @@ class Search:
     along_z: Lines
     inside: np.ndarray
     wavenumber: float
-    phasors: np.ndarray
+    turns: np.ndarray
     beam: np.ndarray
 
     @classmethod
-    def of(cls, channels: Channels, wavenumber: float, limit: float, phasors: np.ndarray) -> Search:
+    def of(cls, channels: Channels, wavenumber: float, limit: float, turns: np.ndarray) -> Search:
         """Directions within `limit` on both axes, or within the half turn that the array tells
         apart."""
-        positions, limits = channels.positions[:, [0, 2]], np.minimum(limit, phasors / 2)
-        seen = np.ptp(positions, axis=0) > SAME_PLACE_M
-        aperture = np.array([aperture_of(along) for along in positions.T])
+        places, limits = channels.positions[:, [0, 2]], np.minimum(limit, turns / 2)
+        seen = np.ptp(places, axis=0) > SAME_POSITION_M
+        aperture = np.array([aperture_of(along) for along in places.T])
         beam = np.where(seen, 2 * np.pi / (wavenumber * aperture), 0.0)
         for step in (beam / STEPS_OF_A_BEAM, 2 * beam / STEPS_OF_A_BEAM):
             u = x, z = tuple(_grid(*of) for of in zip(limits, step, strict=True))
             if x.size * z.size <= MOST_DIRECTIONS:
                 break
         # a channel belongs to the longer of the two lines through it
-        row, column = (_numbers(along) for along in positions.T[::-1])
+        row, column = (_numbers(along) for along in places.T[::-1])
         on_x = np.bincount(row)[row] >= np.bincount(column)[column]
-        phases = wavenumber * positions
+        phases = wavenumber * places
         along_x = Lines.of(phases, np.where(on_x, row, -1), u, 0)
         along_z = Lines.of(phases, np.where(on_x, -1, column), u, 1)
         inside = np.add.outer(x**2, z**2) <= 1
-        return cls(channels, u, along_x, along_z, inside, wavenumber, phasors, beam)
+        return cls(channels, u, along_x, along_z, inside, wavenumber, turns, beam)
 
     @property
     def steps(self) -> np.ndarray:
@@ -138,7 +138,7 @@ class Search:
     def reading(self, cosines: np.ndarray) -> np.ndarray:
         """Directions (..., 2) by the nearest to boresight of those that the channels do not tell
         apart; NaN beyond the horizon, and on an axis that they do not observe."""
-        u = folded(cosines, self.phasors)
+        u = folded(cosines, self.turns)
         real = (u**2).sum(axis=-1, keepdims=True) <= 1
         return np.where(real & self.observed, u, np.nan)
 
@@ -150,8 +150,8 @@ class Search:
             ends = np.cumsum([0, *(len(m) for m in lines.members)])
             spectra = np.concatenate([np.zeros((u.size, 0), np.complex64), *lines.spectra], 1)
             cosines, sines = np.stack([spectra.real, spectra.imag])
-            phasors = np.stack([lines.phasors.real, lines.phasors.imag])
-            axes.append(Axis(ends, cosines, sines, phasors))
+            turns = np.stack([lines.turns.real, lines.turns.imag])
+            axes.append(Axis(ends, cosines, sines, turns))
         order = np.concatenate([*self.along_x.members, *self.along_z.members])
         return order, axes[0], axes[1]
 
@@ -169,9 +169,9 @@ class Search:
 
     def spread(self, cosine: float) -> np.ndarray:
         """(L, L) by which a box of directions, so wide, tapers a covariance."""
-        positions = self.channels.positions
-        phases = (positions[:, None] - positions) * self.wavenumber / (2 * np.pi) * cosine
-        return (np.sinc(phases[..., 0]) * np.sinc(phases[..., 2])).astype(np.float32)
+        places = self.channels.positions
+        apart = (places[:, None] - places) * self.wavenumber / (2 * np.pi) * cosine
+        return (np.sinc(apart[..., 0]) * np.sinc(apart[..., 2])).astype(np.float32)
 
     def lines(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Spectra of the lines along X (S, T, lines, G) and Z (S, T, lines, H) of channels (S, T,
@@ -196,7 +196,7 @@ def _grid(limit: float, step: float) -> np.ndarray:
 
 def _numbers(along: np.ndarray) -> np.ndarray:
     """Number the lines of channels at `along` across them [m]."""
-    return np.unique(np.round(along / SAME_PLACE_M), return_inverse=True)[1]
+    return np.unique(np.round(along / SAME_POSITION_M), return_inverse=True)[1]
 
 
 def turned(phases: np.ndarray) -> np.ndarray:
@@ -215,8 +215,8 @@ def search_of(antennas: Antennas, wavenumber: float, passes: int, limit: float =
     if passes == 1:
         rx = np.arange(antennas.num_rx)
         channels = Channels(np.zeros_like(rx), rx, antennas.rx_positions)
-    phasors = antennas.phasors(2 * np.pi / wavenumber, passes)
-    return Search.of(channels, wavenumber, limit, phasors)
+    turns = antennas.turns(2 * np.pi / wavenumber, passes)
+    return Search.of(channels, wavenumber, limit, turns)
 
 
 def channel_search(antennas: Antennas, wavenumber: float) -> Search:
@@ -343,11 +343,11 @@ def climbed(
     towards = search.steering(cosines)
     for part in CLIMBED:
         step = part * search.steps
-        phasors = search.steering(step * AROUND)  # the phases of two directions add
-        values = statistic(towards[:, None] * phasors)
+        turns = search.steering(step * AROUND)  # the phases of two directions add
+        values = statistic(towards[:, None] * turns)
         best = values.argmax(axis=1)
         peak, cosines = values[each, best], cosines + step * AROUND[best]
-        towards = towards * phasors[best]
+        towards = towards * turns[best]
     return peak, cosines
 
 
@@ -397,11 +397,11 @@ def direction_bound(antennas: Antennas, passes: int, wavenumber: float) -> np.nd
 
     The inverse of :math:`2 k^2 C`, with C the covariance of the channels' places.
     """
-    positions = antennas.virtual_positions if passes == 2 else antennas.rx_positions
+    places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
     axes = np.flatnonzero(antennas.observes(passes))
     out = np.diag([np.inf, np.inf])
     if axes.size:
-        fisher = np.atleast_2d(2 * wavenumber**2 * np.cov(positions[:, 2 * axes].T, bias=True))
+        fisher = np.atleast_2d(2 * wavenumber**2 * np.cov(places[:, 2 * axes].T, bias=True))
         least = 1e-9 * np.trace(fisher) * np.eye(axes.size)  # of a row that stands askew
         out[np.ix_(axes, axes)] = np.linalg.inv(fisher + least)
     return out
@@ -466,8 +466,8 @@ def quadratic_forms(
     for axis, other in ((x, "ij"), (z, "ji")):
         line = np.repeat(np.arange(axis.ends.size - 1), np.diff(axis.ends))
         along = axis.cosines + 1j * axis.sines
-        phasors = (axis.phasors[0] + 1j * axis.phasors[1])[line]
-        parts.append(np.einsum(f"in,nj->{other}n", along, phasors))
+        turns = (axis.turns[0] + 1j * axis.turns[1])[line]
+        parts.append(np.einsum(f"in,nj->{other}n", along, turns))
     against = np.concatenate(parts, axis=2)  # a^*, of directions (i, j)
     Q = matrices[:, order][:, :, order]
     forms = np.einsum("ijm,smn,ijn->sij", against, Q, against.conj(), optimize=True)
@@ -479,24 +479,24 @@ def strongest_on_grid(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Largest sum of |a^H y|^2 over the looks of y (S, T, L) times a scale (S or 1, G, H), and its
     direction, interpolated."""
-    peak, index = np.zeros(len(y), np.float32), np.zeros((len(y), 2), np.float32)
+    peak, place = np.zeros(len(y), np.float32), np.zeros((len(y), 2), np.float32)
     _, x, z = search.axes
     inside, first = search.inside.ravel().astype(np.float32), [u[0] for u in search.cosines]
     lines = search.lines(y)
-    search_directions(*lines, x.phasors, z.phasors, inside, scale.astype(np.float32), peak, index)
-    return peak, first + index * search.steps
+    search_directions(*lines, x.turns, z.turns, inside, scale.astype(np.float32), peak, place)
+    return peak, first + place * search.steps
 
 
 @twin_of(receive_directions.search_directions)
 def search_directions(
     along_x: np.ndarray,
     along_z: np.ndarray,
-    phasors_z: np.ndarray,
-    phasors_x: np.ndarray,
+    turns_z: np.ndarray,
+    turns_x: np.ndarray,
     inside: np.ndarray,
     scale: np.ndarray,
     peak: np.ndarray,
-    index: np.ndarray,
+    place: np.ndarray,
 ) -> None:
     """Fill the largest power of each cell over all directions, and its place in steps of the grid,
     by a parabola through the logarithms of three neighbours on both axes.
@@ -504,23 +504,22 @@ def search_directions(
     Parameters
     ----------
     along_x, along_z : (S, T, lines, G) and (S, T, lines, H) complex64 spectra of the lines
-    phasors_z, phasors_x : (2, lines, H or G) cosines and sines of the lines' places
-        on the other axis
+    turns_z, turns_x : (2, lines, H or G) cosines and sines of the lines' places on the other axis
     inside : (G H) 1 for directions of the unit disc, else 0
     scale : (S or 1, G, H) of the power summed over the looks
-    peak, index : (S,) and (S, 2) float32
+    peak, place : (S,) and (S, 2) float32
     """
-    beams = np.einsum("stki,kj->stij", along_x, phasors_z[0] + 1j * phasors_z[1])
-    beams = beams + np.einsum("stkj,ki->stij", along_z, phasors_x[0] + 1j * phasors_x[1])
+    beams = np.einsum("stki,kj->stij", along_x, turns_z[0] + 1j * turns_z[1])
+    beams = beams + np.einsum("stkj,ki->stij", along_z, turns_x[0] + 1j * turns_x[1])
     power = (np.abs(beams) ** 2).sum(axis=1) * scale
     best = (power.reshape(len(power), -1) * inside).argmax(axis=1)
     for s, at in enumerate(zip(*np.divmod(best, power.shape[2]), strict=True)):
-        peak[s], index[s] = power[s][at], at
+        peak[s], place[s] = power[s][at], at
         for axis, line in enumerate((power[s][:, at[1]], power[s][at[0]])):
             if 0 < at[axis] < line.size - 1:
                 three = np.maximum(line[at[axis] - 1 : at[axis] + 2], 1e-20)
                 low, _, high = np.log(three / three[1])
                 if low + high < 0:
                     offset = np.clip(0.5 * (low - high) / (low + high), -0.5, 0.5)
-                    index[s, axis] += offset
+                    place[s, axis] += offset
                     peak[s] *= np.exp(((high - low) + (low + high) * offset) * offset / 2)

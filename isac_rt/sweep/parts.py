@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from isac_rt.frame.antennas import SAME_PLACE_M, Antennas, resolutions
+from isac_rt.frame.antennas import SAME_POSITION_M, Antennas, resolutions
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
@@ -109,7 +109,7 @@ def horizontal_lines(
     unknown: each transmit antenna has lines of its own.
     """
     places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
-    height = np.round(places[:, 2] / SAME_PLACE_M)
+    height = np.round(places[:, 2] / SAME_POSITION_M)
     repeated = 1 if passes == 2 else antennas.num_tx
     lines = [
         (np.flatnonzero(height == z) + k * len(places), places[height == z, 0])
@@ -119,7 +119,7 @@ def horizontal_lines(
     longest = max(np.ptp(x) for _, x in lines)
     long = [line for line in lines if np.ptp(line[1]) >= 0.49 * longest]
     beam, limit = resolutions(waveform, antennas, passes)[2], antennas.view_limit
-    half = int(np.ceil(STEPS_PER_BEAM * limit / beam)) if longest > SAME_PLACE_M else 0
+    half = int(np.ceil(STEPS_PER_BEAM * limit / beam)) if longest > SAME_POSITION_M else 0
     return np.linspace(-limit, limit, 2 * half + 1) if half else np.zeros(1), tuple(long)
 
 
@@ -150,7 +150,7 @@ def labels(setup: Setup, frame: Frame, link: Link) -> tuple[np.ndarray, np.ndarr
         images, leakage), or a UAV
     """
     paths, sent, w = frame.paths[link], frame.sent[link.tx], setup.waveform
-    clock = setup.connections.apart(link.tx, link, paths.epoch)
+    clock = setup.connections.clock_difference(link.tx, link, paths.epoch)
     rate = paths.delay_rate + clock.drift
     rows, columns = w.num_range_cells, w.num_chirps
     row = w.beat_cells(paths.delay + clock.offset, rate, 0.0)
