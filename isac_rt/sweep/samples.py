@@ -35,7 +35,7 @@ class Samples:
     ----------
     folder : of a data set
     split : its name
-    keep : arrays that are read, parts or their axes; None: all
+    keep : arrays that are read; None: all
 
     Raises
     ------
