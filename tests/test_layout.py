@@ -244,7 +244,7 @@ MAX_LINES = {
     "receive": 6065,
     "track": 1901,
     "scenario": 1710,
-    "results": 3645,
+    "results": 3647,
     "simulation": 3420,
     "sweep": 2790,
     "views": 3070,
