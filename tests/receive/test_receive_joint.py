@@ -21,7 +21,7 @@ from isac_rt.receive.joint.moments import Moments, _weights
 from isac_rt.receive.joint.neighbours import (
     _beams,
     _earlier_reference,
-    _hidden,
+    _further_path,
     _widened,
     refine_jointly,
 )
@@ -473,7 +473,7 @@ def test_what_is_too_weak_beside_a_path_is_not_looked_at(level_db: float, looked
     start = JointPath(
         2 * NEAR[0] / C, 2 * NEAR[1] / C, np.array(NEAR[2:4]), np.ones(1), np.zeros(4)
     )
-    found = _hidden(moments, fit(moments, [start]), [0])
+    found = _further_path(moments, fit(moments, [start]), [0])
     assert (found is not None) == looked_at
     if found:
         assert found[1] == 0 and found[2].direction == pytest.approx(
