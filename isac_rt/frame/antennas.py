@@ -134,7 +134,7 @@ class Antennas:
             array = np.asarray(value, float)
             if array.ndim != 2 or array.shape[1] != 2 or not array.size:
                 raise ValueError(
-                    f"{name}: needs places (x, z) of (L, 2) numbers, not {array.shape}"
+                    f"{name}: needs positions (x, z) of (L, 2) numbers, not {array.shape}"
                 )
             if not np.isfinite(array).all():
                 raise ValueError(f"{name}: places must be finite numbers [m]")

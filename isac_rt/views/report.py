@@ -156,7 +156,7 @@ def write_report(
     page = template.render(
         summary=s,
         span=f"{span:.2f} s",
-        roles=", ".join(_count(roles.count(r), _ROLES[r]) for r in dict.fromkeys(roles)),
+        roles=", ".join(_count(roles.count(r), _ROLES.get(r, r)) for r in dict.fromkeys(roles)),
         carrier=f"{radio.carrier_hz / 1e9:g} GHz",
         bandwidth=f"{radio.bandwidth_hz / 1e6:g} MHz",
         tables=tables,

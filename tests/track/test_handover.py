@@ -344,7 +344,8 @@ def outside(*symbols: int) -> np.ndarray:
 
 
 def read(symbols, z, sure=100.0, **changes) -> Reception:
-    """A decoded reception with these symbols at the alphabet's ends."""
+    """A decoded reception with these symbols at the alphabet's ends, whose check sum fails if there
+    are some."""
     raw = outside(*symbols)
     confidence = np.full(raw.shape, sure)
     return heard(
@@ -353,7 +354,7 @@ def read(symbols, z, sure=100.0, **changes) -> Reception:
         raw_delay_symbols=raw,
         delay_confidence=confidence,
         confidence_looks=15,
-        **changes,
+        **{"intact": not symbols, **changes},
     )
 
 
@@ -398,7 +399,8 @@ def test_evidence_of_a_slip_is_gathered_over_twelve_frames():
         pt.reference.track.state.mean[3:] = 0
         z = sight() * [1, 0, 1, 1]
         symbols = [[-1], *[[]] * (gap - 1), [-1]]
-        reports.answers = [read(s, z) for s in symbols] + [read([], z - np.array([CELL, 0, 0, 0]))]
+        reports.answers = [read(s, z, intact=False) for s in symbols]
+        reports.answers += [read([], z - np.array([CELL, 0, 0, 0]))]
         for k in range(gap + 1):
             pt.step(EMPTY, OWN, 1e-6 * k, True)
         assert pt.reference.state.slips_repaired == (0 if told_once else 1)

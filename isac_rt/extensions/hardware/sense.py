@@ -30,8 +30,8 @@ def sense(capture: Capture, settings: Receivers) -> Reception:
 
     Raises
     ------
-    CaptureError  If the places of the elements are unknown, or the settings ask for what a measured
-        frame does not have.
+    CaptureError  If the positions of the elements are unknown, or the settings ask for what a
+        measured frame does not have.
     """
     cube = capture.cube
     for key, able in (("clutter_detector", ("cfar",)), ("refinement", ("local", "grid"))):
@@ -77,7 +77,7 @@ def range_azimuth(capture: Capture, azimuth: np.ndarray, farthest: float) -> xr.
 
     Raises
     ------
-    CaptureError  If the places of the elements are unknown.
+    CaptureError  If the positions of the elements are unknown.
     """
     antennas, w = _antennas(capture), capture.cube.waveform
     y = capture.channels()
@@ -112,8 +112,8 @@ def _hann(size: int) -> np.ndarray:
 def _antennas(capture: Capture) -> Antennas:
     if capture.antennas is None:
         raise CaptureError(
-            "the places of the elements are unknown, so no direction can be told; state elements "
-            "in the description"
+            "the positions of the elements are unknown, so no direction can be told; state "
+            "elements in the description"
         )
     return capture.antennas
 

@@ -196,7 +196,7 @@ def test_feedback_undoes_a_slip(monkeypatch, feedback):
     Planted bug: the range moved the other way."""
     from isac_rt.track import reference, terminal
 
-    monkeypatch.setattr(reference, "slip_cells", lambda ends, size: 0)
+    monkeypatch.setattr(reference.Reference, "slip", lambda *frame: 0)
     step, times = terminal.PassiveTerminal.step, []
 
     def slipping(self, cube, own_pose, time, modulated, **options):

@@ -194,7 +194,8 @@ def test_a_whole_bin_more_moves_expected_power_by_a_bin():
     """Power and its slopes, of scatterers between bins and across the ends of the Doppler axis: the
     same grid, places of which come round. Planted bug: the place after the last one is the last."""
     rng, count = np.random.default_rng(17), 40
-    response = Response(W, ROWS, TAPER)
+    _, schedule, payload = frame(waveform=W)
+    response = Response(W, ROWS, TAPER, known(W, schedule, payload).leaks)
     beat, power = rng.uniform(2, ROWS - 3, count), rng.uniform(0.5, 2.0, count)
     doppler, slope = rng.uniform(-0.5, 0.0, count) / 3, rng.normal(size=(count, 1))
     here = response.of(beat, doppler, power, slope)

@@ -214,7 +214,7 @@ def test_an_antenna_that_is_not_connected_is_named(board, receiver, level):
     hurt = samples[:, 2] if receiver else samples[:, :, 2]
     hurt *= level
     capture = replace(capture, cube=replace(capture.cube, samples=samples))
-    told = "receiver 2 hears .* by transmitter 0" if receiver else "receiver 0 .* transmitter 2"
+    told = "receiver 2 receives .* from TX 0" if receiver else "receiver 0 .* TX 2"
     count = 3 if receiver else 5
     with pytest.raises(CaptureError, match=f"{told} more than 20 dB .* {count} of 15 channels"):
         calibrate(capture)
