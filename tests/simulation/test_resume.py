@@ -320,7 +320,7 @@ def test_a_file_from_elsewhere_is_refused_with_one_message(tmp_path, spoil):
     """Planted bug: arrays of objects made."""
     resume = kept(tmp_path, "one" * 4000)
     spoil(tmp_path / FILE)
-    with pytest.raises(ResumeError, match=r"not written by isac-rt.*--restart lets go"):
+    with pytest.raises(ResumeError, match=r"not written by isac-rt.*--restart discards it"):
         list(resume.entries())
 
 
@@ -337,7 +337,7 @@ def test_an_entry_that_is_no_runs_is_refused_before_a_frame(tmp_path, entry):
     scenario = small(frames=4)
     resume = Resume(tmp_path, run_content(scenario, 1))
     resume.append(entry)
-    with pytest.raises(ResumeError, match=r"not written by isac-rt.*--restart lets go"):
+    with pytest.raises(ResumeError, match=r"not written by isac-rt.*--restart discards it"):
         simulate.run(scenario, snapshots=1, resume=resume)
 
 
