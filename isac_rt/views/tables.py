@@ -23,7 +23,7 @@ class Table:
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """A value as people read it; null and what is not finite are a dash."""
+    """Format a value; a dash for null and non-finite values."""
     if value is None or (isinstance(value, float) and value - value != 0):
         return DASH
     if isinstance(value, bool | str):
@@ -58,15 +58,30 @@ LEGEND = {
     "targets; above \u201cNo tracks\u201d they are worse than none.",
     "n": "n: estimates caused by the UAV's own path within three resolution cells, the base of the "
     "RMSE.",
-    "City loss": "City loss: noise-only detection probability less the share found. Masked, "
-    "clutter, not read: target-frames lost behind a stronger path, to clutter, and with the data.",
+    "City loss": "City loss: noise-only detection probability less the share found. Other columns "
+    "by cause: target-frames that were lost.",
+    "Switches": "In view, found, tracked: frames; switches: to another track.",
+    "Too weak": "Too weak: under 13 dB for a matched filter coherent over samples, chirps and "
+    "antennas.",
+    "Not decoded": "Not decoded: the frame's data were erased or wrong.",
+    "Inaccurate": "Inaccurate: over one resolution cell off.",
+    "Noise": "Noise: below the threshold of a detector that adds the channels' powers.",
+    "Masked": "Masked: by a stronger line of sight, mirror image, leakage or UAV.",
+    "Clutter": "Clutter: over the noise in the cell, raising the threshold, or detected instead.",
+    "Threshold": "Threshold: missed by chance.",
+    "Diffuse": "Diffuse: walls, ground and roofs.",
+    "Specular": "Specular: mirror images of the transmitter.",
+    "Target": "Target: a diverged track of a UAV.",
+    "Ghost": "Ghost: an echo of a UAV over a wall.",
+    "Ghosts": "Ghosts: echoes of a UAV over the surface.",
+    "Mirror images": "Mirror images: those of the transmitter.",
 }
-"""What a column title means."""
+"""Meaning of a column title."""
 
 
-def legend(*tables: Table) -> str:
-    """Explain the columns of tables that have rows, each once."""
-    shown = {title for table in tables if table.rows for title in table.columns}
+def legend(*tables: Table, skip: Sequence[str] = ()) -> str:
+    """Explain the columns of tables that have rows, each once, except those to `skip`."""
+    shown = {title for table in tables if table.rows for title in table.columns}.difference(skip)
     return " ".join(text for title, text in LEGEND.items() if title in shown)
 
 
@@ -201,7 +216,7 @@ _CITY = ("ghost", "specular", "diffuse")
 def city_costs(summary: Mapping[str, Any]) -> Table:
     """Tabulate the targets that each set of receivers loses to the city, and the false tracks that
     the city causes; no rows where none are compared."""
-    causes = {"Masked": "masked", "Clutter": "clutter", "Not read": "not_read"}
+    causes = {"Masked": "masked", "Clutter": "clutter", "Not decoded": "not_read"}
     rows = []
     for link, name, one in _sets(summary):
         noise_only, hits = one["bounds"]["clutter_free"], one["hit_rate"]
@@ -337,8 +352,8 @@ def _traffic(fused: Mapping[str, Any], receives: bool) -> tuple[str, str, str]:
 
 
 def false_table(summary: Mapping[str, Any]) -> Table:
-    """False tracks per frame of each link by what feeds them; causes that never were are left
-    out."""
+    """Tabulate the false tracks per frame of each link by cause, without causes that do not occur;
+    no rows without false tracks."""
     links = {name: s for name, s in summary["links"].items() if "false_tracks" in s}
     causes = [c for c in FALSE_CAUSES if any(s["false_tracks"][c] for s in links.values())]
     rows = [
@@ -347,6 +362,7 @@ def false_table(summary: Mapping[str, Any]) -> Table:
             *map(number, (s["false_tracks_per_frame"], *map(s["false_tracks"].get, causes))),
         )
         for name, s in links.items()
+        if causes
     ]
     titles = (cause.replace("_", " ").capitalize() for cause in causes)
     return Table((_FALSE, "All", *titles), rows)
@@ -400,7 +416,8 @@ def loss_table(summary: Mapping[str, Any], group: str) -> Table:
     """Tabulate the outcome of every target-frame in view; causes without frames are left out."""
     rows = list(_uavs(summary, group))
     causes = [c for c in LOSSES if any(t["losses"][c] for _, _, t in rows)]
-    titles = (cause.replace("_", " ").capitalize() for cause in causes)
+    words = ("not decoded" if cause == "not_read" else cause for cause in causes)
+    titles = (cause.replace("_", " ").capitalize() for cause in words)
     return Table(
         ("Link", "UAV", *titles),
         [(link, uav, *(number(t["losses"][c]) for c in causes)) for link, uav, t in rows],

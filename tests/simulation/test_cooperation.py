@@ -189,8 +189,8 @@ def test_the_report_and_the_moving_picture_show_the_pictures(talked):
     moving._func(1)
     marks = {line.get_label(): line.get_xdata() for line in figure.axes[0].lines}
     here = d.uav_position.values[int(d.snapshot_frame.values[1]), 2, 0]
-    assert marks["fused tracks of the whole swarm"] == pytest.approx([here], abs=1.0)
-    assert marks["its fused tracks"] == pytest.approx([here], abs=1.0)
+    assert marks["fused tracks, swarm"] == pytest.approx([here], abs=1.0)
+    assert marks["fused tracks"] == pytest.approx([here], abs=1.0)
 
 
 def test_a_reference_is_not_told_as_a_detection():
