@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -77,6 +77,8 @@ def replay(path: Path | str) -> dict[str, Any]:
         data = {name: file[name] for name in file.files}
     public = json.loads(str(data["public"]))
     w = Waveform(**public["waveform"])
+    if w.checked is not None:  # JSON knows no tuples
+        w = replace(w, checked=tuple(map(tuple, w.checked)))
     known = (
         w,
         Antennas(**public["antennas"]),

@@ -90,12 +90,11 @@ _RATES = {
     "SER DPSK": "ser_dpsk",
     "BER": "ber",
     "Erased": "erased",
-    "Bits": "bits",
     "Bit rate [kbit/s]": "bit_rate_bps",
 }
 
 _FRAMES = {
-    "Frames erased": "erased",
+    "Frames unread": "erased",
     "Misread": "misread",
     "Frames read": "read",
     "Late": "late",
@@ -161,7 +160,7 @@ def hit_table(summary: Mapping[str, Any], group: str) -> Table:
 def bound_table(summary: Mapping[str, Any], group: str) -> Table:
     """Tabulate the share of ``targets`` or ``terminals`` found by link, its bounds, and SNR."""
     titles = ("Matched filter", "Noise only", "Known clutter", "Found", "False alarms")
-    losses = ("SNR [dB]", "Windows [dB]", "Straddling [dB]", "Clutter [dB]")
+    losses = ("SNR [dB]", "Windows [dB]", "Off grid [dB]", "Clutter [dB]")
     rows = []
     for link, s, part in _parts(summary, group):
         found = *part["bounds"].values(), part["hit_rate"], s["false_per_frame"]

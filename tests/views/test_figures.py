@@ -181,7 +181,6 @@ def test_report_is_one_self_contained_page(run, written):
     for text in (
         "AT to PT1",
         "passive",
-        "25,758",
         "line of sight",
         "prefers-color-scheme",
         "viewport",
