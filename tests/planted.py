@@ -115,7 +115,9 @@ OF_CASES = {
         "self._motion(inside).reshape(3, 3)",
         "self._motion(inside).reshape(3, 3) * [[1.0], [1.001], [1.0]]",
     ),
-    "longitude and latitude to metres": Bug("world/city/place.py", "+ellps=WGS84", "+ellps=sphere"),
+    "longitude and latitude to metres": Bug(
+        "world/city/georeference.py", "+ellps=WGS84", "+ellps=sphere"
+    ),
     "buildings are closed and face outward": Bug(
         "world/city/prism.py",
         "Surface(vertices, cap[:, ::-1], finish.floor)",
@@ -228,8 +230,8 @@ OF_CASES = {
     ),
     "noise and merged clutter": Bug(
         "propagation/clutter/merging.py",
-        "most = eased * error**2 * (1 + clutter)",
-        "most = eased * error * (1 + clutter)",
+        "most = factor * error**2 * (1 + clutter)",
+        "most = factor * error * (1 + clutter)",
     ),
     "mean power of a street": Bug(
         "kernels/propagation_field.py",
@@ -337,8 +339,8 @@ OF_CASES = {
     ),
     "delay symbol errors": Bug(
         "receive/symbols.py",
-        "turn = tones(-beats[m] / w.num_samples, w.num_samples)",
-        "turn = tones(-np.floor(beats[m]) / w.num_samples, w.num_samples)",
+        "derotation = tones(-beats[m] / w.num_samples, w.num_samples)",
+        "derotation = tones(-np.floor(beats[m]) / w.num_samples, w.num_samples)",
     ),
     "data at the ends of the velocity": Bug(
         "receive/symbols.py",
@@ -451,8 +453,8 @@ OF_CASES = {
     ),
     "each part of a board counts": Bug(
         "extensions/hardware/calibrate.py",
-        "out = out * turn * (1 + one.response_slope * place)",
-        "out = out * turn * (1 + 0 * one.response_slope * place)",
+        "out = out * phasor * (1 + one.response_slope * relative)",
+        "out = out * phasor * (1 + 0 * one.response_slope * relative)",
     ),
     "people in a measured frame": Bug(
         "extensions/hardware/readers.py",
@@ -475,7 +477,9 @@ OF_CASES = {
         "return (field * vertical(legs.arrival)).sum(1)",
         "return np.abs((field * vertical(legs.arrival)).sum(1))",
     ),
-    "paths missed in a city": Bug("propagation/legs/chains.py", "- LIFT * side", "+ LIFT * side"),
+    "paths missed in a city": Bug(
+        "propagation/legs/chains.py", "- RAY_OFFSET_M * side", "+ RAY_OFFSET_M * side"
+    ),
     "echoes against sionna": Bug(
         "propagation/raytrace.py",
         "on.bounces[j] <= most",
@@ -520,8 +524,8 @@ OF_TESTS = (
         "test_hard_geometry::test_a_transmitter_close_to_a_wall_or_on_it",
         Bug(
             "propagation/legs/clearance.py",
-            "float(distance_to_triangles(city.corners[near], places[name]).min())",
-            "float(np.abs(city.normals @ places[name] - city.plane_offsets).min())",
+            "float(distance_to_triangles(city.corners[near], positions[name]).min())",
+            "float(np.abs(city.normals @ positions[name] - city.plane_offsets).min())",
         ),
     ),
     (
@@ -644,7 +648,7 @@ OF_TESTS = (
     ),
     (
         "test_view::test_a_body_is_in_view_of_both_ends",
-        Bug("results/metrics.py", "ends.append((active, body))", "pass"),
+        Bug("results/metrics.py", "ends.append((active, uav))", "pass"),
     ),
     (
         "test_access_stages::test_the_timetable_on_paper",
@@ -718,7 +722,11 @@ OF_TESTS = (
     ),
     (
         "test_scoring::test_an_alias_or_a_drifted_track_does_not_stand_for_a_uav",
-        Bug("results/scoring.py", "near = (apart < GOSPA_CUTOFF_M) |", "near = (apart < np.inf) |"),
+        Bug(
+            "results/scoring.py",
+            "near = (distance < GOSPA_CUTOFF_M) |",
+            "near = (distance < np.inf) |",
+        ),
     ),
     (
         "test_swarm_scores::test_tracked_is_within_three_resolutions_of_a_link_that_sees_it",

@@ -247,7 +247,7 @@ MAX_LINES = {
     "results": 3647,
     "simulation": 3420,
     "sweep": 2790,
-    "views": 3070,
+    "views": 3080,
     "cli": 2235,
     "extensions": 12935,
 }

@@ -106,7 +106,7 @@ def test_a_changed_line_runs(copy, file, old, new, answer):
 @pytest.mark.parametrize(
     "body",
     [
-        "{'a': x, 'b': 2}['a'] + 1",
+        pytest.param("{'a': x, 'b': 2}['a'] + 1", marks=pytest.mark.slow),
         pytest.param(
             "np.linalg.solve(np.eye(3), np.full(3, 1.0 * x)).sum() + np.random.rand()",
             marks=pytest.mark.slow,

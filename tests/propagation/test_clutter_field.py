@@ -465,7 +465,7 @@ def test_what_a_terminal_expects_of_a_wall_whitens_any_other_draw_of_it():
     cells = [part[:440] for part in np.nonzero(held > 50 * noise)]
     R = Bucketed.of(truth, known, search, noise, Taper(0, 0, 0)).covariances(*cells)
     inverse = np.linalg.inv(Bucketed.of(thought, known, search, noise, TAPER).covariances(*cells))
-    u = np.stack(np.meshgrid(search.cosines, search.cosines, indexing="ij"), axis=-1)
+    u = np.stack(np.meshgrid(*search.cosines, indexing="ij"), axis=-1)
     a = search.steering(u[search.inside])
     left = []
     for true, white in zip(R, inverse, strict=True):

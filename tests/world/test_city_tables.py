@@ -386,7 +386,7 @@ def test_bent_tables_and_rasters_give_a_city_or_one_message(kind, tmp_path):
         table().to_file(tmp_path / f"town.{kind}")
     whole = {file: file.read_bytes() for file in tmp_path.iterdir() if file.suffix != ".geojson"}
     name, keys = ("t.geojson", {"terrain": "dem.tif"}) if kind == "tif" else (f"town.{kind}", {})
-    for case in range(int(os.environ.get("FUZZ", "4"))):
+    for case in range(int(os.environ.get("FUZZ", "2"))):
         chance = random.Random(f"{kind} {case}")
         for file, data in whole.items():
             file.write_bytes(data)
