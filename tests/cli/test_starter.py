@@ -109,7 +109,9 @@ def test_a_path_may_have_any_letters(tmp_path):
     assert scenario.city_path().read_bytes() == QUARTER.read_bytes()
 
 
-@pytest.mark.parametrize("make", [osm, swiss, pytest.param(quarter, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "make", [osm, *(pytest.param(f, marks=pytest.mark.slow) for f in (swiss, quarter))]
+)
 def test_the_swarm_is_among_buildings_in_sight_and_before_a_wall(make, tmp_path):
     """By trimesh's rays. Planted bug: no site is good, so that the swarm flies over the highest
     roof, as it did."""

@@ -222,6 +222,7 @@ def swarm(seed: int, snr_db: float) -> Network:
     )
 
 
+@pytest.mark.slow
 def test_clocks_are_as_sure_as_stated():
     """120 links of 40 drawn swarms at -12 to 30 dB per sample, two rounds on the exact signal: RMS
     of errors over their stated deviations is 0.8 to 1.25 (chi-square: 0.94 to 1.06 at one sigma) of
