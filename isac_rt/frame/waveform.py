@@ -378,6 +378,10 @@ def waveform_of(r: Radio, a: Array, modulation: Modulation | None = None) -> Wav
     )
 
 
+MAIN_LOBE = 2
+"""Half width of a Hann window's main lobe [cells]."""
+
+
 def hann(position: np.ndarray, length: float) -> np.ndarray:
     """Hann window of `length` that starts at 0, at any (fractional) position; 0 outside."""
     inside = (position >= 0) & (position <= length)

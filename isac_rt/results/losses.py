@@ -13,7 +13,7 @@ from scipy.special import chndtr
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import Transmission
 from isac_rt.frame.schedule import is_latin
-from isac_rt.frame.waveform import Waveform
+from isac_rt.frame.waveform import MAIN_LOBE, Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.receive.cfar import STRONG, CfarRule, hann_envelope
 from isac_rt.receive.maps import UNION_FLOOR
@@ -32,8 +32,6 @@ SIDELOBE_MARGIN = 4.0
 (`cfar.without_sidelobes`)."""
 HANN_LOSS = 1.5
 """Noise bandwidth of a Hann window in cells."""
-MAIN_LOBE = 2
-"""Half width of a Hann window's main lobe in cells."""
 
 
 class Loss(IntEnum):

@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from isac_rt.extensions.city_receivers.walls import Walls
-from isac_rt.frame.antennas import Antennas, resolutions
-from isac_rt.frame.waveform import Waveform
+from isac_rt.frame.antennas import Antennas, folded, resolutions
+from isac_rt.frame.waveform import MAIN_LOBE, Waveform
 from isac_rt.kernels import track_images
 from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.track_images import EDGE, LEAST_RANGE
@@ -26,8 +26,6 @@ from isac_rt.track.parts import Own, TrackRule
 from isac_rt.world.mirrors import mirror_image
 from isac_rt.world.swarm import Pose
 
-BESIDE_CELLS = 1.5
-"""Off an image by no more cells of range and of rate than these, a detection is taken for it."""
 WELL_INSIDE = 0.95
 """Share of the view's largest cosines within which a direction is no alias of one outside."""
 ALIAS_DEVIATIONS = 3.0
@@ -49,8 +47,9 @@ class Images(TrackRule):
         self._edge = WELL_INSIDE * antennas.view_limit
         self._ambiguity = Ambiguity.of(waveform, passes)
         cells = np.array([waveform.range_cell(passes), waveform.velocity_cell(passes)])
-        self._beside = BESIDE_CELLS * cells
+        self._beside = MAIN_LOBE * cells
         self._beam = resolutions(waveform, antennas, 1)[2:]
+        self._turns = antennas.turns(waveform.wavelength, passes)
 
     def births(self, detections: Detections, own: Own) -> Detections:
         d = detections
@@ -63,8 +62,8 @@ class Images(TrackRule):
         return replace(d, starts=starts)
 
     def _beside_images(self, d: Detections, own: Own) -> np.ndarray:
-        """(Q,) which detections may be images: at a passive terminal those that come from one
-        too."""
+        """(Q,) which detections lie within an image's main lobe: at a passive terminal in direction
+        too, or in an alias of it."""
         reach = float(d.range.max()) + 1
         if self._passes == 2:
             shown = own_images(own.pose, self._walls, reach)
@@ -75,7 +74,7 @@ class Images(TrackRule):
         off = np.abs(wrapped(d.measured[:, None, :2] - shown[:, :2], self._ambiguity))
         beside = (off < self._beside).all(axis=-1)
         if self._passes == 1:
-            away = np.abs(d.direction[:, None] - shown[:, 2:])
+            away = np.abs(folded(d.direction[:, None] - shown[:, 2:], self._turns))
             beside &= (away < self._beam + ALIAS_DEVIATIONS * d.std[:, None, 2:]).all(axis=-1)
         return np.asarray(beside.any(axis=1))
 

@@ -201,12 +201,12 @@ def detections(range_: list[float], velocity: list[float], u_x: list[float]) -> 
 
 def test_images_and_aliases_start_no_track():
     """One cell of range off the wall's image and at its rate, also one period of velocities off;
-    two cells off; at the edge of the view. Planted bugs: range alone decides; velocities not
+    2.1 cells off; at the edge of the view. Planted bugs: range alone decides; velocities not
     folded."""
     cell, period = W.range_cell(2), 2 * W.max_velocity(2)
     found = Images(city(WALL), ANTENNAS, W, 2).births(
         detections(
-            [9.6 + cell, 9.6, 9.6 + 2 * cell, 9.6, 30.0],
+            [9.6 + cell, 9.6, 9.6 + 2.1 * cell, 9.6, 30.0],
             [-0.6, -0.6 + period, -0.6, 1.2, 3.0],
             [0.2, 0.2, 0.2, 0.2, 0.85],
         ),
@@ -216,20 +216,39 @@ def test_images_and_aliases_start_no_track():
 
 
 def test_images_of_the_transmitter_start_no_track_where_they_stand():
-    """Off the transmitter's image in a wall by nothing; by two cells of length; by two of rate; and
+    """Off the transmitter's image in a wall by nothing; by 2.1 cells of length; by 2.1 of rate; and
     from elsewhere. Planted bugs: the direction left out; the receiver's own image instead."""
     sender = np.append(OWN.position, [1.3, -0.4, 2.2])
     own = pose([3.7, 8.9, 2.2], [1.0, 0.0, 0.0])
     z = sender_images(sender, own, city(WALL), 100.0)[0]
     known = Track.of_body(Gaussian(sender, 1e-4 * np.eye(6)))
     d = detections(
-        [z[0], z[0] + 2 * W.range_cell(1), z[0], z[0]],
-        [z[1], z[1], z[1] + 2 * W.velocity_cell(1), z[1]],
+        [z[0], z[0] + 2.1 * W.range_cell(1), z[0], z[0]],
+        [z[1], z[1], z[1] + 2.1 * W.velocity_cell(1), z[1]],
         [z[2], z[2], z[2], z[2] - 0.5],
     )
     d = replace(d, direction=np.column_stack([d.direction[:, 0], np.full(4, z[3])]))
     found = Images(city(WALL), ANTENNAS, W, 1).births(d, Own(own, 0.0, reference=known))
     assert found.starts.tolist() == [False, True, True, True]
+
+
+def test_an_image_beyond_the_view_starts_no_track_in_its_alias():
+    """The transmitter's image 75 degrees off the boresight shows where phases between antennas
+    0.577 wavelengths apart differ by a whole turn, 1 / 0.577 of a cosine on; half of that is no
+    alias. Planted bug: directions compared as they are."""
+    sender = np.append(OWN.position, [1.3, -0.4, 2.2])
+    off = np.deg2rad(75.0)
+    toward = np.array([17.2, -12.0, 2.0])  # from the receiver to the image behind the wall
+    right = np.array([toward[1], -toward[0], 0.0]) / np.hypot(*toward[:2])
+    ahead = np.array([*toward[:2], 0.0]) / np.hypot(*toward[:2])
+    own = pose([3.7, 8.9, 2.2], (np.cos(off) * ahead - np.sin(off) * right).tolist())
+    z = sender_images(sender, own, city(WALL), 100.0)[0]
+    assert z[2] > 0.9
+    known = Track.of_body(Gaussian(sender, 1e-4 * np.eye(6)))
+    d = detections([z[0], z[0]], [z[1], z[1]], [z[2] - 1 / 0.5774, z[2] - 0.5 / 0.5774])
+    d = replace(d, direction=np.column_stack([d.direction[:, 0], np.full(2, z[3])]))
+    found = Images(city(WALL), ANTENNAS, W, 1).births(d, Own(own, 0.0, reference=known))
+    assert found.starts.tolist() == [False, True]
 
 
 @pytest.mark.parametrize(("seen", "gone"), [(4, 6), (2, 3)])
