@@ -36,7 +36,7 @@ PANELS: dict[str, dict[Callable[..., None], str]] = {
         sweeps.dataset: "dataset scenes/sweeps/canyon_dataset.yaml --workers 2",
     },
     "Look at a scenario or a run": {
-        simulation.view: "view scenes/street_canyon.yaml --out scene.html",
+        simulation.view: "view scenes/street_canyon.yaml",
         simulation.figures: "figures runs/munich --as svg --style column",
         simulation.animate: "animate runs/munich --out runs/munich/run.mp4",
         simulation.paths: "paths scenes/street_canyon.yaml --frame 3 --out paths.nc",

@@ -331,13 +331,18 @@ def paths(
 def view(
     scenario: ScenarioFile,
     out: Annotated[
-        Path,
-        typer.Option(metavar="FILE", help="A .png picture, or an .html page with a 3-D scene."),
-    ],
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="A .png picture, or an .html page with a 3-D scene.",
+            show_default="SCENARIO.html",
+        ),
+    ] = None,
     frame: FrameNumber = 0,
     overrides: Overrides = None,
 ) -> None:
     """Render the city, the swarm and the paths of a frame."""
+    out = out or Path(f"{scenario.stem}.html")
     if out.suffix not in (".png", ".html"):
         raise InputProblem(f"--out {out}: a view is a .png picture or an .html page; name it so")
     from isac_rt.scenario.file import load
