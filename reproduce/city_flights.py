@@ -108,8 +108,8 @@ PLACES = {
         "munich_swarm.yaml",
         78,
         changes=(
-            "belief={velocity_mps: [0.06, 0.06, 0.05], level_db: 3, mesh_m: 0.1, "
-            "position_m: [0.06, 0.06, 0.05], attitude_deg: [0.3, 0.3, 0.3]}",
+            "belief={velocity_std_mps: 0.06, level_db: 3, mesh_m: 0.1, position_std_m: 0.06, "
+            "attitude_std_deg: 0.3}",
         ),
         compared=(),
     ),
@@ -120,7 +120,7 @@ PLACES = {
         compared=(),
     ),
 }
-"""By name. Wrong beliefs: 0.1 m/s, 3 dB, 0.1 m of place and of each face, 0.5 degrees."""
+"""By name. Wrong beliefs: 0.1 m/s, 3 dB, 0.1 m of place and of each plane, 0.5 degrees (rms)."""
 
 
 @dataclass(frozen=True)

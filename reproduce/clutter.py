@@ -405,9 +405,7 @@ def _statistics(scenes: Scenes) -> pd.DataFrame:
     rows = [{"clutter": "rayleigh", "speed_mps": 0.0, **numbers.RAYLEIGH}]
     for place in PLACES_USED:
         for speed in (0.0, SPEED):
-            expected = scenes.expectation.clutter(
-                place, scenes.pose(place, speed), scenes.epoch, scenes.amplitude
-            )
+            expected = scenes.expected(place, scenes.pose(place, speed))
             found = numbers.statistics(
                 expected, scenes.setup.waveform, scenes.amplitude, scenes.setup.antennas.gain
             )

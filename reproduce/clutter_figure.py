@@ -105,9 +105,7 @@ def _below(axes, scenes: Scenes) -> None:
     uav = (scenes.amplitude * gain * uav) ** 2
     rng = np.random.default_rng(1)
     for place in [name for name in COLOURS if name in scenes.setup.swarm.uavs]:
-        clutter = scenes.expectation.clutter(
-            place, scenes.pose(place, 10.0), scenes.epoch, scenes.amplitude
-        )
+        clutter = scenes.expected(place, scenes.pose(place, 10.0))
         cell, power = cell_powers(clutter, w)
         look = {"color": COLOURS[place], "lw": 1}
         over = 10 * np.log10(np.maximum(power[at], 1e-30) / uav)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from isac_rt.extensions.city_receivers.expectation import make_expectation
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.level import thermal_noise_power, transmit_amplitude
@@ -22,6 +23,7 @@ from isac_rt.propagation.free_space import radar_amplitude
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.randomness import generator, seed_sequence
+from isac_rt.receive.types import ExpectedClutter
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.if_signal import add_noise, if_signal
 from isac_rt.signal.methods import Auto
@@ -126,18 +128,28 @@ class Scenes:
     """All places, ready for frames."""
 
     def __init__(self, scene: Scenario) -> None:
-        from isac_rt.extensions.city_receivers.expectation import MeshExpectation
         from isac_rt.propagation.raytrace import RayTracer
 
         self.setup: Setup = prepare(scene)
         tracer, expectation = self.setup.propagation, self.setup.expectation
         assert isinstance(tracer, RayTracer)
-        assert isinstance(expectation, MeshExpectation)
+        assert expectation is not None
         assert tracer.field is not None
-        self.field, self.expectation = tracer.field.whole(), expectation
+        self.field = tracer.field.whole()
+        self._expectations = {0.0: expectation}
         self.amplitude = transmit_amplitude(scene.noise)
         self.noise = thermal_noise_power(scene.noise, self.setup.waveform)
         self.epoch = self.setup.waveform.frame_duration / 2
+
+    def expected(self, place: str, pose: Pose, mesh_std: float = 0.0) -> ExpectedClutter:
+        """Clutter that the terminal expects at a pose, from a mesh whose planes are off [m]."""
+        s = self.setup
+        if mesh_std not in self._expectations:
+            city = s.city.displaced(mesh_std, generator(s.scenario.seed, "mesh error"))
+            about = s.scenario.clutter, s.swarm, city, s.waveform, s.antennas, s.scenario.seed
+            self._expectations[mesh_std] = make_expectation(*about)
+        copy = self._expectations[mesh_std]
+        return copy.clutter(place, pose, self.epoch, self.amplitude)
 
     def pose(self, place: str, speed: float) -> Pose:
         """Pose of a terminal that flies over ground along its boresight."""

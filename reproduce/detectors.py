@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -34,7 +34,6 @@ from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import ExpectedClutter, Hints
 from isac_rt.results.metrics import binomial_interval
-from isac_rt.track.expectation import Mistakes
 from reproduce.clutter_scenes import (
     PLACES,
     SPEED,
@@ -67,6 +66,16 @@ COMPARED = "square", "street"
 
 
 @dataclass(frozen=True)
+class Mistakes:
+    """Errors of a terminal: of its velocity [m/s], of the expected level, and the standard
+    deviation of its mesh's planes along their normals [m]."""
+
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    level_db: float = 0.0
+    mesh_std: float = 0.0
+
+
+@dataclass(frozen=True)
 class Detector:
     """A row of the comparison.
 
@@ -81,12 +90,12 @@ class Detector:
 
     text: str
     settings: dict
-    mistakes: Mistakes | None = None
+    mistakes: Mistakes = Mistakes()
     fitted: bool = True
 
 
 ALL_WRONG = Mistakes((0.07, 0.07, 0.0), -3.0, 0.1)
-"""0.1 m/s, 3 dB too low, 0.1 m rms of every face."""
+"""0.1 m/s, 3 dB too low, 0.1 m rms of every plane."""
 VELOCITY_WRONG = Mistakes(ALL_WRONG.velocity)
 LEVEL_WRONG = Mistakes(level_db=ALL_WRONG.level_db)
 MESH_WRONG = Mistakes(mesh_std=ALL_WRONG.mesh_std)
@@ -238,14 +247,13 @@ def _ratios(
     return [one.ratio for one in judged]
 
 
-def _expected(
-    scenes: Scenes, place: str, speed: float, mistakes: Mistakes | None
-) -> ExpectedClutter:
+def _expected(scenes: Scenes, place: str, speed: float, mistakes: Mistakes) -> ExpectedClutter:
     """What the terminal expects, without what is 20 dB and more under a cell's noise."""
     w = scenes.setup.waveform
-    found = scenes.expectation.clutter(
-        place, scenes.pose(place, speed), scenes.epoch, scenes.amplitude, mistakes
-    )
+    pose = scenes.pose(place, speed)
+    pose = replace(pose, velocity=pose.velocity + np.array(mistakes.velocity))
+    found = scenes.expected(place, pose, mistakes.mesh_std)
+    found = replace(found, power=found.power * 10 ** (mistakes.level_db / 10))
     return found.select(found.power > 0.01 * scenes.noise * 2.25 / (w.num_samples * w.num_chirps))
 
 

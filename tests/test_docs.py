@@ -31,9 +31,9 @@ def site(tmp_path_factory) -> Path:
     pytest.importorskip("sphinx")
     out = tmp_path_factory.mktemp("site")
     before = files_of(ROOT / "docs")
+    options = ["-q", "-W", "--keep-going", "-D", "gallery_draws=0"]
     done = subprocess.run(
-        [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-D", "gallery_draws=0"]
-        + [str(ROOT / "docs"), str(out)],
+        [sys.executable, "-m", "sphinx", *options, str(ROOT / "docs"), str(out)],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,

@@ -1,7 +1,7 @@
 """Directive `picture`: draws what the scenario below it gives, and shows both.
 
-The argument is `view`, or a method of `isac_rt.Plots` with the name of a link's receiver and further
-words of it: `range_doppler PT1`, `paths AT doppler`.
+The argument is `view`, or a method of `isac_rt.Plots` with its arguments: `range_doppler PT1`,
+`paths AT doppler`.
 """
 
 from __future__ import annotations

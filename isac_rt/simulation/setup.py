@@ -53,10 +53,10 @@ from isac_rt.simulation.preflight import (
     warn_of_unseen,
 )
 from isac_rt.simulation.stopwatch import NONE, Seconds
-from isac_rt.track.expectation import ClutterExpectation, Mistakes
-from isac_rt.track.settings import Belief
+from isac_rt.track.expectation import ClutterExpectation
 from isac_rt.world.area import city_about, city_digest
 from isac_rt.world.city import CityMesh
+from isac_rt.world.city.materials import believed_materials
 from isac_rt.world.swarm import Pose, Swarm
 
 BY_BEAM = 10.0
@@ -198,6 +198,8 @@ class Setup:
     antennas: Antennas
     swarm: Swarm
     city: CityMesh
+    believed_city: CityMesh
+    """The city in the terminals' maps, with the errors of `belief`."""
     propagation: Propagation
     reference: FreeSpace
     """Closed forms of the reference paths, as they would be unshadowed and in view."""
@@ -231,7 +233,7 @@ class Setup:
             reference=free,
             plan=plan,
             propagation=_maker(self.scenario, plan, free, self.city, floor)(),
-            expectation=_expectation_of(self.scenario, plan, free, self.city),
+            expectation=_expectation_of(self.scenario, plan, free, self.believed_city),
         )
 
     @property
@@ -280,26 +282,22 @@ class Setup:
     def walls(self) -> Any:
         """Terminals' model of the city, with which track initiation and track management test
         detections (`isac_rt.extensions.city_receivers.walls.Walls`)."""
-        return extension("walls")(self.city.without(self.scenario.belief.missing_m))
+        return extension("walls")(self.believed_city)
 
-    def believed(self, pose: Pose) -> Pose:
-        """Return a pose with the navigation errors of `belief`."""
+    def believed(self, name: str, pose: Pose) -> Pose:
+        """Return a terminal's pose with its navigation errors, drawn once by `belief`."""
         belief = self.scenario.belief
-        if belief == Belief():
+        std = belief.position_std_m, belief.velocity_std_mps, np.radians(belief.attitude_std_deg)
+        if not any(std):
             return pose
-        rotation = Rotation.from_rotvec(np.radians(belief.attitude_deg)).as_matrix()
+        rng = generator(self.scenario.seed, "belief", name)
+        position, velocity, turn = np.array(std)[:, None] * rng.standard_normal((3, 3))
         return replace(
             pose,
-            position=pose.position + np.array(belief.position_m),
-            velocity=pose.velocity + np.array(belief.velocity_mps),
-            rotation=rotation @ pose.rotation,
+            position=pose.position + position,
+            velocity=pose.velocity + velocity,
+            rotation=Rotation.from_rotvec(turn).as_matrix() @ pose.rotation,
         )
-
-    @property
-    def mistakes(self) -> Mistakes:
-        """Errors of the terminals' clutter model, besides their pose."""
-        belief = self.scenario.belief
-        return Mistakes(level_db=belief.level_db, mesh_std=belief.mesh_m, seed=self.scenario.seed)
 
     @cached_property
     def coverage(self) -> Coverage:
@@ -372,10 +370,8 @@ class Setup:
         out = {}
         for name in (link.tx for link in self.timetable.links(frame) if link.own):
             when = self.timetable.epoch(frame, name)
-            pose = self.believed(self.swarm.trajectories[name].pose(when))
-            out[name] = self.expectation.clutter(
-                name, pose, when, self.plan.amplitude, self.mistakes
-            )
+            pose = self.believed(name, self.swarm.trajectories[name].pose(when))
+            out[name] = self.expectation.clutter(name, pose, when, self.plan.amplitude)
         return out
 
 
@@ -460,18 +456,20 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
         content = path_content(scenario.model_dump(mode="json"), digest)
         content = json.dumps([content, city.num_faces, "" if floor is None else floor.record()])
         propagation = CachedPropagation(make, store, content)
+    believed = _believed_city(scenario, city)
     setup = Setup(
         scenario,
         waveform,
         antennas,
         swarm,
         city,
+        believed,
         propagation,
         free,
         timetable,
         Connections(),
         plan,
-        _expectation_of(scenario, plan, free, city),
+        _expectation_of(scenario, plan, free, believed),
     )
     _ = setup.calibration  # a file that is none is refused here
     setup = _connected(setup)
@@ -490,16 +488,25 @@ def _maker(
 
 
 def _expectation_of(
-    scenario: Scenario, plan: Plan, free: FreeSpace, city: CityMesh
+    scenario: Scenario, plan: Plan, free: FreeSpace, believed: CityMesh
 ) -> ClutterExpectation | None:
     if not scenario.needs_mesh:
         return None
-    believed = city.without(scenario.belief.missing_m)
     about = scenario.clutter, plan.swarm, believed, plan.waveform
     own = [link for link in plan.timetable.all_links if link.own]
     floor = _floor_of(scenario, plan, free, own)
     make = extension("expected_clutter")
-    found: ClutterExpectation = make(*about, plan.antennas, scenario.seed, floor)
+    level = scenario.belief.level_db
+    found: ClutterExpectation = make(*about, plan.antennas, scenario.seed, floor, level)
+    return found
+
+
+def _believed_city(scenario: Scenario, city: CityMesh) -> CityMesh:
+    belief = scenario.belief
+    rng = generator(scenario.seed, "mesh error")
+    found = city.without(belief.missing_m).displaced(belief.mesh_m, rng)
+    if belief.materials:
+        found = replace(found, materials=believed_materials(found.materials, belief.materials))
     return found
 
 

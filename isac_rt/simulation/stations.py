@@ -90,7 +90,7 @@ class Station:
         begun = time.thread_time()
         timetable, (tx, rx) = self.setup.timetable, self.link
         when = timetable.epoch(frame.number, tx)
-        own = self.setup.believed(self.setup.swarm.trajectories[rx].pose(when))
+        own = self.setup.believed(rx, self.setup.swarm.trajectories[rx].pose(when))
         reported_poses = self._reported_poses(frame.number, when)
         state = int(TerminalState.TRACKING)
         late: tuple[Late, ...] = ()
@@ -127,7 +127,7 @@ class Station:
         s = self.setup
         if s.scenario.cooperation == "none":
             return None
-        return s.believed(s.swarm.trajectories[self.link.tx].pose(when))
+        return s.believed(self.link.tx, s.swarm.trajectories[self.link.tx].pose(when))
 
     def _reported_poses(self, frame: int, when: float) -> list[Pose]:
         """Return the reported poses that the receiver uses: of the other end of the link, or at an
@@ -137,7 +137,7 @@ class Station:
             return []
         tx, rx = self.link
         names = s.timetable.with_role("passive", frame) if self.link.own else [tx]
-        return [s.believed(s.swarm.trajectories[name].pose(when)) for name in names if name != rx]
+        return [s.believed(n, s.swarm.trajectories[n].pose(when)) for n in names if n != rx]
 
     def feed_back(self, frame: int, received: LinkResult, at_active: LinkResult) -> None:
         """Exchange the feedback of the passive terminal after a frame, and the answer of the active

@@ -7,7 +7,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
-from isac_rt.settings import Decibels, Finite, Node, Positive, Problem, Vector
+from isac_rt.settings import Decibels, Finite, Node, Positive, Problem
+from isac_rt.world.settings import MaterialOverride
 
 
 class Tracking(Node):
@@ -73,24 +74,36 @@ def _four_numbers(value: Any) -> Any:
 Rectangle = Annotated[tuple[Finite, Finite, Finite, Finite], BeforeValidator(_four_numbers)]
 
 
+Deviation = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
+
+
 class Belief(Node):
     """Errors in what terminals believe of themselves and of the city, to measure their cost.
     Transmission and echoes follow the truth."""
 
+    REMOVED: ClassVar[dict[str, str]] = {
+        "position_m": "belief.position_std_m, of the errors drawn for each terminal",
+        "velocity_mps": "belief.velocity_std_mps, of the errors drawn for each terminal",
+        "attitude_deg": "belief.attitude_std_deg, of the errors drawn for each terminal",
+    }
+
     missing_m: tuple[Rectangle, ...] = ()
     """Rectangles [x_min, y_min, x_max, y_max] on the ground whose buildings are missing in the
     terminals' mesh [m]: all faces that lie wholly within one. By default none."""
-    position_m: Vector = (0.0, 0.0, 0.0)
-    """Error of the position that each terminal believes to be at: east, north, up [m]. By default
-    none."""
-    velocity_mps: Vector = (0.0, 0.0, 0.0)
-    """Error of the velocity that each terminal believes to have: east, north, up [m/s]. By default
-    none."""
-    attitude_deg: Vector = (0.0, 0.0, 0.0)
-    """Turn of the attitude that each terminal believes to have, about the axes east, north and up
-    [deg]. By default none."""
+    position_std_m: Deviation = 0.0
+    """Standard deviation of the position error on each axis [m], drawn once for each terminal. By
+    default 0."""
+    velocity_std_mps: Deviation = 0.0
+    """Standard deviation of the velocity error on each axis [m/s], drawn once for each terminal. By
+    default 0."""
+    attitude_std_deg: Deviation = 0.0
+    """Standard deviation of the attitude error about each axis [deg], drawn once for each terminal.
+    By default 0."""
     level_db: Decibels = 0.0
     """Error of the clutter's level that terminals expect [dB]. By default none."""
-    mesh_m: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
-    """Standard deviation of the error of each face of the terminals' mesh along its normal [m], for
-    the clutter that they expect. By default none."""
+    mesh_m: Deviation = 0.0
+    """Standard deviation of the error of each plane of the terminals' mesh along its normal [m]:
+    expected clutter, walls and mirror images lie where that mesh has them. By default 0."""
+    materials: dict[str, MaterialOverride] = Field({})
+    """Properties of the city's materials, by name, that terminals believe in place of the true
+    ones; keys as in `city.materials`. By default the true ones."""

@@ -10,6 +10,7 @@ from talking import scenario
 
 from isac_rt.document import ScenarioError
 from isac_rt.extensions.city_receivers import static_clutter as standing
+from isac_rt.runtime import UserError
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare
@@ -17,41 +18,49 @@ from isac_rt.track.settings import Belief
 
 SCENES = Path(__file__).parents[2] / "scenes"
 
-WRONG = Belief(position_m=(0.3, -0.2, 0.1), velocity_mps=(0.5, 0.0, 0.0), attitude_deg=(0, 0, 2.0))
+WRONG = Belief(position_std_m=0.3, velocity_std_mps=0.5, attitude_std_deg=2.0)
 
 
-def test_a_believed_pose_is_the_true_one_with_its_errors():
-    """Two degrees about the vertical turn the boresight, which looks north, to the west. Planted
-    bugs: the turn about the body's own axes; degrees for radians."""
+def test_believed_poses_have_errors_of_their_own():
+    """Over 2000 terminals' names the errors on each axis have the deviations stated (5 % are four
+    deviations of an estimate), those of one stay over time, and its axes stay at right angles.
+    Planted bugs: degrees for radians; one error for all; a new one at each time."""
     setup = prepare(scenario(belief=WRONG))
-    true = setup.swarm.trajectories["PT"].pose(0.1)
-    found = setup.believed(true)
-    assert np.allclose(found.position - true.position, [0.3, -0.2, 0.1])
-    assert np.allclose(found.velocity - true.velocity, [0.5, 0, 0])
-    turned = np.array([[np.cos(a := np.radians(2)), -np.sin(a), 0], [np.sin(a), np.cos(a), 0]])
-    assert np.allclose(found.rotation[:2], turned @ true.rotation)
-    north = prepare(scenario(belief=WRONG)).believed(setup.swarm.trajectories["AT"].pose(0.0))
-    assert north.rotation[0, 1] == pytest.approx(-np.sin(a))
-    assert prepare(scenario()).believed(true) is true
+    true, later = (setup.swarm.trajectories["PT"].pose(t) for t in (0.1, 0.7))
+    off = []
+    for k in range(2000):
+        found, again = (setup.believed(f"T{k}", pose) for pose in (true, later))
+        turned = found.rotation @ true.rotation.T
+        assert np.allclose(turned @ turned.T, np.eye(3))
+        assert np.allclose(again.position - later.position, found.position - true.position)
+        turn = np.array([turned[2, 1], turned[0, 2], turned[1, 0]]) - turned.T[[2, 0, 1], [1, 2, 0]]
+        shift = found.position - true.position, found.velocity - true.velocity
+        off.append([*shift, np.degrees(turn / 2)])
+    found = np.square(off).mean(axis=(0, 2)) ** 0.5
+    assert found == pytest.approx([0.3, 0.5, 2.0], rel=0.05)
+    assert prepare(scenario()).believed("PT", true) is true
 
 
 def test_only_terminals_are_wrong():
-    """Samples, paths and symbols are those of a right run; tracks follow the same echoes, and the
-    PT's echo lies where the AT believes it, beside where it is by the error of the position.
-    Planted bugs: the swarm itself moved; the true pose told to the others, so that the PT is not
-    where it says."""
-    belief = WRONG.model_copy(update={"attitude_deg": (0.0, 0.0, 0.0)})
+    """Samples, paths and symbols are those of a right run; the tracks of an AT alone follow the
+    same echoes, and lie off in the world by the error of its position. Planted bug: the swarm
+    itself moved."""
+    belief = Belief(position_std_m=0.3, velocity_std_mps=0.1)
     right = simulate.run(scenario(frames=6), snapshots=0)
     wrong = simulate.run(scenario(frames=6, belief=belief), snapshots=0)
     for name in ("det_range", "det_u_x", "path_power", "uav_position", "symbol_errors", "hit"):
         assert np.array_equal(right.dataset[name], wrong.dataset[name]), name
     places = []
-    for d in (right.dataset, wrong.dataset):
-        mine = (d.fused_frame.values == 5) & (d.fused_picture.values == 0)
-        (k,) = np.flatnonzero(mine & (d.fused_terminal.values == 1))
+    alone = {name: uav for name, uav in scenario().swarm.items() if name != "PT"}
+    for change in ({}, {"belief": belief}):
+        d = simulate.run(scenario(frames=6, swarm=alone, **change), snapshots=0).dataset
+        (k,) = np.flatnonzero((d.fused_frame.values == 5) & (d.fused_picture.values == 0))
         places.append([float(d[f"fused_{axis}"].values[k]) for axis in "xyz"])
-    # the pair's weights change with what they say
-    assert np.allclose(np.subtract(*places[::-1]), belief.position_m, atol=0.05)
+    setup = prepare(scenario(frames=6, belief=belief))
+    pose = setup.swarm.trajectories["AT"].pose(0.0)
+    error = setup.believed("AT", pose).position - pose.position
+    assert np.abs(error).max() > 0.2
+    assert np.allclose(np.subtract(*places[::-1]), error, atol=0.05)
 
 
 def test_a_mesh_without_a_building(tmp_path):
@@ -77,6 +86,33 @@ def test_a_mesh_without_a_building(tmp_path):
     assert setup.city.without([(-200, -200, 0.5, 200)]).num_faces == 3  # none lies wholly within
     with pytest.raises(ScenarioError, match="in this order"):
         load(tmp_path / "s.yaml", ["belief.missing_m=[[5, 0, 1, 2]]"])
+
+
+def test_planes_of_the_terminals_mesh_lie_off():
+    """Each plane of a town lies off along its normal by an error of the deviation stated (within
+    three of an estimate's), both triangles of a wall alike. Planted bugs: faces moved one by one;
+    along the vertical."""
+    city = prepare(scenario(city={"source": "blocks"})).city
+    off = city.displaced(0.2, np.random.default_rng(3))
+    moved = ((off.corners - city.corners) * city.normals[:, None]).sum(axis=-1)
+    assert np.allclose(off.corners - city.corners, moved[..., None] * city.normals[:, None])
+    assert np.ptp(moved, axis=1).max() < 1e-9
+    first = np.unique(city.plane_of_face, return_index=True)[1]
+    assert np.allclose(moved[:, 0], moved[first, 0][city.plane_of_face])
+    assert moved[first, 0].std() == pytest.approx(0.2, rel=3 / np.sqrt(2 * len(first)))
+    assert city.displaced(0.0, np.random.default_rng(3)) is city
+
+
+def test_terminals_believe_materials(tmp_path):
+    """The field keeps the true ones; a material that the city lacks is refused. Planted bug: the
+    city's own changed."""
+    changes = {"materials": {"concrete": {"scattering_coefficient": 0.77}}}
+    setup = prepare(scenario(city={"source": "canyon"}, belief=changes))
+    believed, true = ({m.name: m for m in c.materials} for c in (setup.believed_city, setup.city))
+    assert believed["concrete"].scattering_coefficient == 0.77
+    assert true["concrete"].scattering_coefficient != 0.77
+    with pytest.raises(UserError, match=r"belief\.materials\.glass: the city has no such"):
+        prepare(scenario(city={"source": "canyon"}, belief={"materials": {"glass": {}}}))
 
 
 @pytest.mark.slow

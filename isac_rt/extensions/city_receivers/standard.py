@@ -88,7 +88,7 @@ def equipment_of(setup: Setup, link: Link, s: ReceiverSet | Scenario) -> Equipme
     clutter = None
     if s.receivers.passive_detector == "beams" and setup.expectation is not None:
         between, amplitude = setup.expectation.between, setup.plan.amplitude
-        clutter = partial(between, link, amplitude, mistakes=setup.mistakes)
+        clutter = partial(between, link, amplitude)
     order, groups = setup.scenario.modulation.dpsk_order, setup.timetable.groups(link)
     return _passive_equipment(*known, order, groups, Surroundings(walls, clutter))
 

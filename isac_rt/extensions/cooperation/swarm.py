@@ -99,7 +99,7 @@ class Cooperation(Stateful):
         time = max(timetable.epoch(frame, tx) for tx in timetable.with_role("active", frame))
         traffic = self._carry(frame, received, symbols)
         self._carry_late(late, traffic)
-        poses = {n: self._setup.believed(p) for n, p in self._setup.swarm.poses(time).items()}
+        poses = {n: self._setup.believed(n, p) for n, p in self._setup.swarm.poses(time).items()}
         for name, notes in self._notes.items():
             notes.stand(time, of_itself(poses[name]))
         for link, result in received.items():
@@ -164,7 +164,7 @@ class Cooperation(Stateful):
         tracks rest on."""
         setup, tracks = self._setup, received.tracks
         time = setup.timetable.epoch(frame, link.tx)
-        own = setup.believed(setup.swarm.trajectories[link.rx].pose(time))
+        own = setup.believed(link.rx, setup.swarm.trajectories[link.rx].pose(time))
         clock = 0.0
         if not link.own:
             clock = SPEED_OF_LIGHT * setup.connections.offset_std(link, time)
@@ -180,7 +180,7 @@ class Cooperation(Stateful):
         scan = scan_of(link, frame, time, own, received, clock)
         notes.see(scan)
         if isinstance(self._swarm, CentralisedTracker):
-            sender = setup.believed(setup.swarm.trajectories[link.tx].pose(time))
+            sender = setup.believed(link.tx, setup.swarm.trajectories[link.tx].pose(time))
             at = None if link.own else np.concatenate([sender.position, sender.velocity])
             self._swarm.add(scan, at)
 

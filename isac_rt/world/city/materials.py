@@ -402,6 +402,25 @@ def _base(use: MaterialUse, carrier_frequency: float, change: MaterialOverride |
     return material
 
 
+def believed_materials(
+    materials: Sequence[Material], changes: Mapping[str, MaterialOverride]
+) -> tuple[Material, ...]:
+    """Materials of a city with the properties that terminals believe, by name.
+
+    Raises
+    ------
+    CityError  If the city has no such material.
+    """
+    wanted = {canonical_name(name) or name: change for name, change in changes.items()}
+    names = {m.name for m in materials}
+    for name in wanted.keys() - names:
+        raise CityError(
+            f"belief.materials.{name}: the city has no such material; it has "
+            f"{', '.join(sorted(names)) or 'none'}"
+        )
+    return tuple(_override(m, wanted[m.name]) if m.name in wanted else m for m in materials)
+
+
 def resolve_materials(
     uses: Sequence[MaterialUse], carrier_frequency: float, overrides: Mapping[str, MaterialOverride]
 ) -> tuple[list[int], tuple[Material, ...]]:

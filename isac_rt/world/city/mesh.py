@@ -195,6 +195,17 @@ class CityMesh:
         ]
         return self.of(~np.any(out, axis=0))
 
+    def displaced(self, std: float, rng: np.random.Generator) -> CityMesh:
+        """The city with each of its planes moved along its normal by a Gaussian error of `std` [m];
+        this very city if that is 0. Planes come apart at their edges."""
+        if not std:
+            return self
+        plane = self.plane_of_face
+        error = std * rng.standard_normal(int(plane.max(initial=-1)) + 1)
+        corners = self.corners + (error[plane, None] * self.normals)[:, None]
+        own = np.arange(3 * self.num_faces, dtype=np.int32).reshape(-1, 3)
+        return replace(self, vertices=corners.reshape(-1, 3), faces=own)
+
     def of(self, some: NDArray[np.bool_]) -> CityMesh:
         """Some of the faces, with what they need."""
         faces, face_material = self.faces[some], self.face_material[some]
