@@ -46,7 +46,6 @@ class MeshExpectation:
         wavelength: float,
         seed: int,
         floor: NoiseFloor | None = None,
-        level_db: float = 0.0,
     ) -> None:
         own = int(seed_sequence(seed, "expected clutter").generate_state(1)[0])
         about = city, scene, wavelength, own
@@ -61,7 +60,7 @@ class MeshExpectation:
             else None
         )
         self._city, self._antennas = city, antennas
-        self._level = 10 ** (level_db / 20)
+        self.level = 1.0  # factor of all amplitudes, of terminals that are wrong about it
 
     def __len__(self) -> int:
         return len(self._field.cells)
@@ -76,7 +75,7 @@ class MeshExpectation:
         amplitude : sqrt(transmit power of one antenna) [sqrt(W)]
         """
         local = self._local(pose)
-        amplitude *= self._level
+        amplitude *= self.level
         state = LinkState(Link(name, name), time, local, local)
         mirrored = [] if self._two_bounces is None else self._two_bounces.seen(state)
         parts = [self._own.seen(state), *(part.seen for part in mirrored)]
@@ -113,7 +112,7 @@ class MeshExpectation:
         parts = []
         for seen in [self._field.from_places(state), *(part.seen for part in mirrored)]:
             received = self._antennas.element_gain(end.to_body(seen.arrival))
-            gain = self._level * np.sqrt(self._antennas.gain * received)
+            gain = self.level * np.sqrt(self._antennas.gain * received)
             parts.append(_expected(seen, amplitude * gain, end))
         return ExpectedClutter.joined(parts)
 
@@ -151,4 +150,6 @@ def make_expectation(
 
     scene = shared_scenes(city, waveform.carrier_frequency).faces
     about = clutter, swarm, city, scene, antennas, waveform.wavelength, seed, floor
-    return MeshExpectation(*about, level_db)
+    found = MeshExpectation(*about)
+    found.level = 10 ** (level_db / 20)
+    return found
