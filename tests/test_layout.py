@@ -247,7 +247,7 @@ MAX_LINES = {
     "results": 3645,
     "simulation": 3420,
     "sweep": 2790,
-    "views": 3080,
+    "views": 3490,
     "cli": 2240,
     "extensions": 12935,
 }

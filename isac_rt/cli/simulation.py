@@ -438,8 +438,9 @@ def export(
         typer.Option(
             "--as",
             metavar="FORMAT",
-            help="csv: tables; mat: MATLAB; glb: 3-D scene; stonesoup: detections; sigmf: IF "
-            "samples of one frame.",
+            help="csv: tables; mat: MATLAB; pcd: point clouds; glb: 3-D scene; stonesoup: "
+            "detections. IF samples of all frames and links: npy, mat_samples, sigmf, or bin, a "
+            "DCA1000's.",
         ),
     ],
     out: Annotated[
@@ -447,51 +448,65 @@ def export(
         typer.Option(metavar="DIR", help="Folder of the files.", show_default="DIR/export"),
     ] = None,
     frame: Annotated[
-        int | None, typer.Option(min=0, help="Frame, for sigmf.", show_default="the first")
+        int | None, typer.Option(min=0, help="Frame, of IF samples.", show_default="all")
     ] = None,
     link: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Link, for sigmf.", show_default="the first"),
+        typer.Option(metavar="NAME", help="Link, of IF samples.", show_default="all"),
     ] = None,
 ) -> None:
     """Write a run for other programs. IF samples are simulated anew."""
     from isac_rt.results.files import open_results
     from isac_rt.views import export as exports
+    from isac_rt.views.samples import SAMPLE_FORMATS
 
-    check_names([form], [*exports.FORMATS, "sigmf"], "format")
-    if form != "sigmf" and (frame is not None or link is not None):
-        raise InputProblem("--frame and --link are of --as sigmf; leave them out")
+    check_names([form], [*exports.FORMATS, *SAMPLE_FORMATS], "format")
+    if form not in SAMPLE_FORMATS and (frame is not None or link is not None):
+        raise InputProblem(
+            f"--frame and --link are of IF samples, --as {', '.join(SAMPLE_FORMATS)}; leave them "
+            "out"
+        )
 
     results = open_results(folder)
     target = out if out is not None else folder / "export"
-    with ending_soon_after_interrupt(target), working("exporting"):
+    with ending_soon_after_interrupt(target):
         from isac_rt.simulation.setup import city_of
 
-        if form == "sigmf":
-            files = _sigmf(results, frame or 0, link, target)
+        if form in SAMPLE_FORMATS:
+            files = _samples(results, form, target, frame, link)
         else:
-            files = exports.write(results, form, target, lambda: city_of(results.scenario))
+            with working("exporting"):
+                files = exports.write(results, form, target, lambda: city_of(results.scenario))
     for file in files:
         say(file)
 
 
-def _sigmf(results: Results, frame: int, observer: str | None, folder: Path) -> list[Path]:
-    """IF samples of an observer in one frame."""
+def _samples(
+    results: Results, form: str, folder: Path, frame: int | None, observer: str | None
+) -> list[Path]:
+    """Write the IF samples of some frames and links, simulated anew."""
+    from isac_rt.frame.link import Link
     from isac_rt.simulation.setup import prepare
-    from isac_rt.views.interchange import write_sigmf
+    from isac_rt.views.samples import write_samples
 
     d = results.dataset
     names = [str(name) for name in d.observer.values]
-    observer = observer or names[0]
-    check_names([observer], names, "observer")
-    check_frame(results.scenario, frame)
-    here = {"frame": frame, "observer": names.index(observer)}
-    if d.fell_back[here]:
+    if observer is not None:
+        check_names([observer], names, "observer")
+    if frame is not None:
+        check_frame(results.scenario, frame)
+    frames = range(d.sizes["frame"]) if frame is None else [frame]
+    wanted = [k for k, name in enumerate(names) if observer in (None, name)]
+    fell_back = [f for f in frames if d.fell_back.values[f, wanted].any()]
+    if fell_back:
         raise InputProblem(
-            f"--frame {frame}: its transmitter fell back to the conventional schedule, which only "
-            "the run itself knows; choose another frame"
+            f"--frame {fell_back[0]}: its transmitter fell back to the conventional "
+            "schedule, which only the run itself knows; choose another frame"
         )
-    ends = str(d.transmitter[here["observer"]].item()), str(d.receiver[here["observer"]].item())
-    cube = prepare(results.scenario).frame(frame).samples(ends)
-    name = observer.replace("->", "_to_")
-    return list(write_sigmf(cube, folder / f"{name}_{frame:04d}", results.scenario.name))
+    setup = prepare(results.scenario)
+    links = [Link(str(d.transmitter.values[k]), str(d.receiver.values[k])) for k in wanted]
+
+    def write(report: Report) -> list[Path]:
+        return write_samples(setup, frames, links, form, folder, report)
+
+    return list(with_progress(write, "frames", len(frames)))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
 from isac_rt.results.columns import TABLES
@@ -34,6 +35,8 @@ class Results:
     dataset: xr.Dataset
     summary: dict[str, Any]
     scenario: Scenario
+    samples: Mapping[tuple[int, Link], IFCube] = field(default_factory=dict)
+    """IF samples by frame and link, of runs that were told to keep them."""
 
     def __repr__(self) -> str:
         def text(value: float | None, form: str) -> str:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import logging
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from threadpoolctl import threadpool_limits
 
@@ -54,7 +54,7 @@ def run(
     snapshots: int = 3,
     terminal: Callable[[Setup, Link], Terminal | Receiver] = standard_terminal,
     resume: Resume | None = None,
-    observe: Observe | None = None,
+    keep: Observe | Collection[Literal["samples"]] = (),
 ) -> Results:
     """Simulate every frame of a scenario.
 
@@ -71,8 +71,9 @@ def run(
         `ActiveTerminal.receive` or `PassiveTerminal.receive` is, or a terminal, whose tracking may
         be another too
     resume : where the frames are kept meanwhile and from where a run that was stopped goes on
-    observe : called with every frame, link and cube of samples that a receiver is given, in the
-        receivers' threads; not with frames that `resume` has already
+    keep : ["samples"] keeps the cubes of samples in `Results.samples`; a function is called with
+        every frame, link and cube that a receiver is given, in the receivers' threads. Frames that
+        `resume` has already are left out
 
     Returns
     -------
@@ -86,7 +87,15 @@ def run(
     0.0
     """
     run = _Run.begin(scenario, setup, snapshots, terminal)
-    run.observe = observe
+    samples: dict[tuple[int, Link], IFCube] = {}
+
+    def add(frame: Frame, link: Link, cube: IFCube) -> None:
+        samples[frame.number, link] = cube
+
+    if callable(keep):
+        run.observe = keep
+    elif "samples" in keep:
+        run.observe = add
     with followed(progress, scenario.frames) as report:
         run.fly(report, threads, resume)
     summary = run.summary()
@@ -104,7 +113,7 @@ def run(
     dataset = run.recorder.dataset().assign_attrs(
         provenance(scenario) | {name: json.dumps(value) for name, value in attributes.items()}
     )
-    return Results(dataset, summary, scenario)
+    return Results(dataset, summary, scenario, samples)
 
 
 def summarise(

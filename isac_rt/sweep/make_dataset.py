@@ -85,7 +85,7 @@ class SceneJob(Job):
             threads=self.threads,
             snapshots=scenario.frames,
             terminal=standard_terminal if FROM_RECEIVERS & {*self.keep} else lambda *_: _Deaf(),
-            observe=parts,
+            keep=parts,
         )
         begun = time.process_time()
         content = tar_of(samples_of(results, parts, self.keep, f"{self.number:06d}"))

@@ -132,6 +132,6 @@ def test_the_command_says_what_it_wrote(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "stonesoup", None)
     for option in (["--frame", "1"], ["--link", "AT->PT1"]):
         assert main(["export", str(tmp_path / "run"), "--as", "csv", *option]) == 2
-        assert "are of --as sigmf" in capsys.readouterr().err
+        assert "are of IF samples" in capsys.readouterr().err
     assert main(["export", str(tmp_path / "run"), "--as", "stonesoup"]) == 2
     assert "pip install 'isac_rt[interchange]'" in capsys.readouterr().err
