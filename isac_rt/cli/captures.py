@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from isac_rt.cli.arguments import InputProblem
-from isac_rt.cli.console import say, say_table, working
+from isac_rt.cli.console import Report, say, say_table, with_progress, working
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from isac_rt.extensions.hardware.types import Capture
 
 DescriptionFile = Annotated[
     Path | None,
     typer.Option(
-        "--description", metavar="YAML", help="Settings of the board that the file does not hold."
+        "--description",
+        metavar="FILE",
+        help="Settings of the board that the file does not hold: YAML, or TI's .cfg or "
+        ".mmwave.json.",
     ),
 ]
 Format = Annotated[
@@ -178,31 +184,62 @@ def receive(
         ),
     ] = None,
 ) -> None:
-    """Detect targets in measured samples with the active receiver. Writes detections, the
-    range-Doppler map and the range-azimuth map."""
+    """Detect and track targets in measured samples, all frames of a file, with the active receiver.
+    Writes detections, tracks, and the last frame's range-Doppler and range-azimuth maps."""
     import numpy as np
 
     from isac_rt.document import Document
-    from isac_rt.extensions.hardware.sense import as_dataset, range_azimuth, sense
+    from isac_rt.extensions.hardware.sense import range_azimuth, sense_all
     from isac_rt.receive.settings import Receivers
     from isac_rt.results.files import check_folder, write_dataset, write_figure
+    from isac_rt.track.settings import Tracking
     from isac_rt.views.measured import drawn
 
     settings = Receivers()
     if receivers is not None:
         settings = Document(receivers, "state keys of `receivers`").check(Receivers)
     check_folder(out)
-    with working("sensing"):
-        capture = _calibrated(_opened(cube, description), calibration)
-        found = sense(capture, settings)
-        dataset = as_dataset(found)
+    captures, interval = _recorded(cube, description, calibration)
+
+    def work(report: Report) -> xr.Dataset:
+        return sense_all(captures, settings, Tracking(), interval, report)
+
+    dataset = with_progress(work, "frames", len(captures))
+    with working("drawing"):
         write_dataset(dataset, out / "reception.nc")
-        write_figure(out / "range_doppler.png", drawn(dataset.map_power, dataset))
-        view = np.deg2rad(np.linspace(-60, 60, 241))
+        last = dataset.isel(detection=dataset.det_frame.values == len(captures) - 1)
+        write_figure(out / "range_doppler.png", drawn(dataset.map_power, last))
+        view, capture = np.deg2rad(np.linspace(-60, 60, 241)), captures[-1]
         farthest = float(dataset.map_range[-1]) / (2 if capture.one_sided else 1)
         write_figure(out / "range_azimuth.png", drawn(range_azimuth(capture, view, farthest)))
-    say(repr(found.detections))
+    confirmed = np.unique(dataset.track_id.values[dataset.track_confirmed.values])
+    said = f"{dataset.sizes['detection']} detections in {len(captures)} frames"
+    if len(captures) > 1:
+        said += f", {len(confirmed)} confirmed tracks"
+        if interval is None:
+            said += "; state frame_interval_ms in the description for tracks"
+    say(said)
     say(f"in {out}: reception.nc, range_doppler.png, range_azimuth.png")
+
+
+def _recorded(
+    file: Path, description: Path | None, calibration: Path | None
+) -> tuple[Sequence[Capture], float | None]:
+    """Frames of a file with a board's calibration applied, and the time between them [s]."""
+    from isac_rt.extensions.hardware.calibrate import apply, load_calibration
+    from isac_rt.extensions.hardware.description import load_description
+    from isac_rt.extensions.hardware.readers import Corrected, import_frames
+
+    if not _is_imported(file, description):
+        return [_calibrated(_opened(file, description), calibration)], None
+    said = None if description is None else load_description(description)
+    with working("reading the samples"):
+        frames = import_frames(file, said)
+    if calibration is not None:
+        found = load_calibration(calibration)
+        frames = Corrected(frames, lambda capture: apply(found, capture))
+    interval = None if said is None else said.frame_interval_ms
+    return frames, None if interval is None else interval * 1e-3
 
 
 def _imported(file: Path, description: Path | None, format: str | None) -> Capture:
@@ -216,12 +253,17 @@ def _imported(file: Path, description: Path | None, format: str | None) -> Captu
 
 def _opened(file: Path, description: Path | None) -> Capture:
     """A cube that `import` wrote, or what `import` would make of a board's file."""
-    from isac_rt.extensions.hardware.readers import SUFFIXES
     from isac_rt.extensions.hardware.store import load_capture
 
-    if file.suffix in SUFFIXES or description is not None:
+    if _is_imported(file, description):
         return _imported(file, description, None)
     return load_capture(file)
+
+
+def _is_imported(file: Path, description: Path | None) -> bool:
+    from isac_rt.extensions.hardware.readers import SUFFIXES
+
+    return file.suffix in SUFFIXES or description is not None
 
 
 def _calibrated(capture: Capture, calibration: Path | None) -> Capture:

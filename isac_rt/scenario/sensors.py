@@ -7,9 +7,21 @@ evaluation boards.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-Sensor = Literal["awr1843", "awr2944", "iwr6843", "bgt24mtr12"]
+from pydantic import Field
+
+Sensor = Literal[
+    "awr1642",
+    "awr1843",
+    "awr2243",
+    "awr2243_cascade",
+    "awr2944",
+    "bgt24mtr12",
+    "iwr1443",
+    "iwr6843",
+]
+BoardFile = Annotated[str, Field(pattern=r"\.(cfg|json)$")]
 
 _TI_BOARD = {
     "tx": {"shape": "positions", "positions": [[0.0, 0.0], [1.0, 0.5], [2.0, 0.0]]},
@@ -106,6 +118,35 @@ SENSORS: dict[str, dict[str, dict[str, Any]]] = {
         },
         "noise": {"tx_power_dbm": 11.0, "noise_figure_db": 12.0},
     },
+}
+
+
+def _like_awr1843(
+    chirps: int, noise: tuple[float, float], gain_dbi: float, array: dict[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """A sensor with the chirp of the AWR1843 here: chirps in a frame, transmit power [dBm] and
+    noise figure [dB], gain of an element, and its array."""
+    power, figure = noise
+    return {
+        "radio": {**SENSORS["awr1843"]["radio"], "chirps_per_frame": chirps},
+        "array": {**array, "element_gain_dbi": gain_dbi},
+        "noise": {"tx_power_dbm": power, "noise_figure_db": figure},
+    }
+
+
+_IN_A_ROW = {
+    "tx": {"shape": "positions", "positions": [[0.0, 0.0], [2.0, 0.0]]},
+    "rx": _TI_BOARD["rx"],
+}
+_CASCADE = {"tx": {"shape": "ti_cascade"}, "rx": {"shape": "ti_cascade"}}
+SENSORS |= {
+    # 2 TX two wavelengths apart, 4 RX on AWR1642BOOST
+    "awr1642": _like_awr1843(128, (12.5, 15.0), 8.0, _IN_A_ROW),
+    # 3 TX, 4 RX on IWR1443BOOST and AWR2243BOOST
+    "iwr1443": _like_awr1843(192, (12.0, 15.0), 8.0, _TI_BOARD),
+    "awr2243": _like_awr1843(192, (13.0, 13.0), 8.0, _TI_BOARD),
+    # four AWR2243 on MMWCAS-RF-EVM: 12 TX in turn, 16 RX
+    "awr2243_cascade": _like_awr1843(192, (13.0, 13.0), 8.0, _CASCADE),
 }
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from isac_rt.frame.boards import BOARD_FILES, BoardFileError, read_board
 from isac_rt.settings import Key, Problem
 from isac_rt.world.settings import City
 
@@ -274,13 +275,13 @@ def with_tables(
     ------
     TableError  If a file is none, is not readable as a table, or numbers are stated beside it.
     """
-    out = tree
+    out = _with_board(tree, folder, faults)
     for key, name, reader in _tables_of(tree, folder):
         here = _at(out, key)
         file = here.get(name) if isinstance(here, dict) else None
         if not isinstance(file, str):
             continue
-        if out is tree:
+        if out is tree:  # never in place
             out = copy.deepcopy(tree)
             here = _at(out, key)
         try:
@@ -295,6 +296,29 @@ def with_tables(
             continue
         del here[name]
         here.update(found)
+    return out
+
+
+def _with_board(tree: dict[str, Any], folder: Path, faults: list[Problem] | None) -> dict[str, Any]:
+    """A tree whose `sensor` names a board's configuration, with what that says under the keys that
+    are stated."""
+    file = tree.get("sensor")
+    if not isinstance(file, str) or Path(file).suffix not in BOARD_FILES:
+        return tree
+    try:
+        board = read_board(folder / file)
+    except BoardFileError as problem:
+        if faults is None:
+            raise TableError(("sensor",), str(problem)) from None
+        faults.append(Problem((("sensor",),), str(problem)))
+        return {key: value for key, value in tree.items() if key != "sensor"}
+    out = copy.deepcopy(tree)
+    del out["sensor"]
+    for key, values in board.scenario().items():
+        own = out.get(key, {})
+        if isinstance(own, dict):
+            out[key] = {**values, **own}
+    out.setdefault("frame_interval_s", board.period)
     return out
 
 

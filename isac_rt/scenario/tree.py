@@ -33,7 +33,7 @@ from isac_rt.propagation.settings import Clutter, Propagation
 from isac_rt.receive.settings import Receivers
 from isac_rt.scenario.presets import Preset, ReceiverSet, with_preset
 from isac_rt.scenario.radio import Radio
-from isac_rt.scenario.sensors import Sensor, with_sensor
+from isac_rt.scenario.sensors import SENSORS, BoardFile, Sensor, with_sensor
 from isac_rt.scenario.swarm import Uav, formations, unfolded
 from isac_rt.settings import Key, Name, Node, Positive, Problem, Seed, dotted
 from isac_rt.signal.settings import Accuracy
@@ -67,10 +67,11 @@ class Scenario(Node):
     frame_interval_s: Positive | None = None
     """Time from the start of a frame to the start of the next [s], at least a frame long. null, the
     default: frames follow each other without a pause."""
-    sensor: Sensor | None = None
-    """A plain FMCW sensor by name, whose `radio`, `array` and `noise` the keys stated there
-    override: `awr1843` and `awr2944` at 77 GHz, `iwr6843` at 60 GHz, `bgt24mtr12` at 24 GHz. null,
-    the default: none."""
+    sensor: Sensor | BoardFile | None = None
+    """A plain FMCW sensor by name, or a board's configuration (`.cfg`, `.mmwave.json`), whose
+    `radio`, `array` and `noise` the keys stated there override: `awr1642`, `awr1843`, `awr2243`,
+    `awr2243_cascade`, `awr2944` and `iwr1443` at 77 GHz, `iwr6843` at 60 GHz, `bgt24mtr12` at
+    24 GHz. null, the default: none."""
     radio: Radio = Radio()
     """The chirp and the frame. By default the paper's."""
     array: Array = Array()
@@ -219,6 +220,7 @@ class Scenario(Node):
             self._front_end_problems,
             self._self_calibration_problems,
             self._set_problems,
+            self._sensor_problems,
         )
 
     @classmethod
@@ -579,6 +581,11 @@ class Scenario(Node):
                 births = (*at, "births")
                 said = f"{one.births} needs a city; add one or set {dotted(births)} to all"
                 yield Problem((births, ("city",)), said)
+
+    def _sensor_problems(self) -> Iterator[Problem]:
+        if self.sensor is not None and self.sensor not in SENSORS:
+            said = "is read by isac_rt.load, which was not used; state radio and array"
+            yield Problem((("sensor",),), said)
 
     def _set_problems(self) -> Iterator[Problem]:
         for name, one in self.compare.items():

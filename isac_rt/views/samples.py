@@ -212,6 +212,7 @@ class _Dca1000:
         parts = np.abs(first.cube.samples.view(np.float32))
         self._scale = FULL_SCALE / (HEADROOM * max(float(parts.max()), 1e-30))
         self._first, self._frames, self._clipped = first, frames, 0
+        self._starts: list[float] = []
 
     def add(self, one: Recorded) -> None:
         if _loop_of(np.asarray(one.cube.schedule)[0]) != self._loop:
@@ -219,6 +220,7 @@ class _Dca1000:
                 f"--as bin: {one.name} sends in another order in frame {one.frame}; a DCA1000's "
                 "frames are alike, so use --as npy, mat_samples or sigmf"
             )
+        self._starts.append(one.cube.start_time)
         words, clipped = dca1000_words(one.cube.samples[0], self._scale)
         self._clipped += clipped
         with self._file.open("ab") as file:
@@ -242,6 +244,9 @@ class _Dca1000:
             "loops": w.num_chirps // len(self._loop),
             "frames": self._frames,
             "chirp_interval_us": w.sweep.repetition * 1e6,
+            "frame_interval_ms": 1e3 * float(np.diff(self._starts).mean())
+            if self._frames > 1
+            else None,
             "sampling": "complex_1x",
             "elements": {
                 "unit_hz": w.carrier_frequency,

@@ -11,7 +11,9 @@ import numpy as np
 from pydantic import Field
 
 from isac_rt.document import Document
+from isac_rt.extensions.hardware.types import CaptureError
 from isac_rt.frame.antennas import CASCADE_HZ, Antennas, ti_cascade
+from isac_rt.frame.boards import BOARD_FILES, BoardFileError, read_board
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.settings import Node, Problem
 
@@ -72,6 +74,8 @@ class Description(Node):
     chirp_interval_us: Annotated[float, Field(gt=0, le=1e6)] | None = None
     """From the start of a ramp to the start of the next [us]: idle time and ramp. Velocities need
     it."""
+    frame_interval_ms: Annotated[float, Field(gt=0, le=1e6)] | None = None
+    """From the start of a frame to the start of the next [ms]. Tracks need it."""
     sampling: Literal["complex_1x", "complex_2x", "real"] = "complex_1x"
     """What a sample is. `complex_1x`: I and Q of an IF from 0 to the sampling rate; `complex_2x`: I
     and Q of an IF to half of it, with the image band; `real`: I alone, of an IF to half of it.
@@ -122,10 +126,16 @@ class Description(Node):
 
 
 def load_description(file: str | Path) -> Description:
-    """The description that a YAML file holds.
+    """The description that a YAML file holds, or a board's configuration (`read_board`).
 
     Raises
     ------
     isac_rt.document.ScenarioError  With one line per problem.
+    CaptureError  If a board's configuration cannot be used.
     """
+    if Path(file).suffix in BOARD_FILES:
+        try:
+            return Description.model_validate(read_board(file).description())
+        except BoardFileError as problem:
+            raise CaptureError(str(problem)) from None
     return Document(Path(file), "describe the chirp and the frame").check(Description)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -44,6 +45,9 @@ _SIGMF_TYPES = {
     for end, mark in (("_le", "<"), ("_be", ">"))
 } | {f"{part}{kind}8": f"{kind}1" for part in "rc" for kind in "iu"}
 """Numpy's names of a number of each; of a complex sample there are two."""
+_LOG = logging.getLogger(__name__)
+Recording = tuple[int, Callable[[int], Capture]]
+"""Frames of a file, and how each is made."""
 MOST_AMPLITUDE = 1e12
 """No converter counts so far; powers of larger samples overflow."""
 
@@ -64,6 +68,15 @@ def import_file(
     CaptureError  If the file cannot be read, does not fit the description, or holds what is no
         number.
     """
+    found = import_frames(file, description, format)
+    return found[0 if description is None or len(found) == 1 else description.frame]
+
+
+def import_frames(
+    file: str | Path, description: Description | None = None, format: str | None = None
+) -> Sequence[Capture]:
+    """All measured frames of a file; parameters and errors as of `import_file`. A frame is checked
+    when it is taken."""
     file, said = Path(file), description or Description()
     kind = format or said.format or SUFFIXES.get(file.suffix)
     if kind not in _READERS:
@@ -71,26 +84,54 @@ def import_file(
             f"{file}: a name that ends in {file.suffix or 'nothing'} does not tell the format; "
             f"state one of {', '.join(_READERS)}"
         )
-    found = _READERS[kind](file, said)
-    bad = int((~np.isfinite(found.cube.samples)).sum())
-    if bad:
-        raise CaptureError(
-            f"{file}: {bad} of {found.cube.samples.size} samples are not finite; leave such chirps "
-            "out"
-        )
-    largest = float(np.abs(found.cube.samples).max(initial=0.0))
-    if largest > MOST_AMPLITUDE:
-        raise CaptureError(
-            f"{file}: the largest sample is {largest:g}, at most {MOST_AMPLITUDE:g} can be read; "
-            "scale them to counts of the converter or volts"
-        )
-    return found
+    return _Frames(file, _READERS[kind](file, said))
+
+
+class _Frames(Sequence[Capture]):
+    """Frames of a file, each made and checked when it is taken."""
+
+    def __init__(self, file: Path, read: Recording) -> None:
+        self._file, self._read = file, read
+
+    def __len__(self) -> int:
+        return self._read[0]
+
+    def __getitem__(self, k: Any) -> Any:
+        if not -len(self) <= k < len(self):
+            raise IndexError(k)
+        found, file = self._read[1](int(k)), self._file
+        bad = int((~np.isfinite(found.cube.samples)).sum())
+        if bad:
+            raise CaptureError(
+                f"{file}: {bad} of {found.cube.samples.size} samples are not finite; leave such "
+                "chirps out"
+            )
+        largest = float(np.abs(found.cube.samples).max(initial=0.0))
+        if largest > MOST_AMPLITUDE:
+            raise CaptureError(
+                f"{file}: the largest sample is {largest:g}, at most {MOST_AMPLITUDE:g} can be "
+                "read; scale them to counts of the converter or volts"
+            )
+        return found
+
+
+class Corrected(Sequence[Capture]):
+    """Frames with a correction applied when they are taken."""
+
+    def __init__(self, frames: Sequence[Capture], correct: Callable[[Capture], Capture]) -> None:
+        self._frames, self._correct = frames, correct
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, k: Any) -> Any:
+        return self._correct(self._frames[k])
 
 
 # ---- TI's calibration
 
 
-def _ti_calibration(file: Path, d: Description) -> Capture:
+def _ti_calibration(file: Path, d: Description) -> Recording:
     """The mean chirp of every channel, as TI's calibration keeps it: its zero-padded FFT under the
     window sin^2(pi (n+1)/(N+1))."""
     tree = read_mat(file)
@@ -130,7 +171,7 @@ def _ti_calibration(file: Path, d: Description) -> Capture:
     if antennas is None and (num_tx, num_rx) == (12, 16):
         antennas = Antennas.placed(*ti_cascade())
     chirps = samples.transpose(1, 2, 0)[None]  # (group, rx, chirp, sample)
-    return _capture(file, said, chirps, antennas, "ti_calibration")
+    return 1, lambda _: _capture(file, said, chirps, antennas, "ti_calibration")
 
 
 def _stated(
@@ -185,14 +226,14 @@ def _without_window(file: Path, spectra: np.ndarray, stated: int | None) -> np.n
 # ---- DCA1000
 
 
-def _dca1000(file: Path, d: Description) -> Capture:
+def _dca1000(file: Path, d: Description) -> Recording:
     """Raw samples of 16 bits as TI's capture card streams them."""
     said = _complete(file, d)
     rows, num_rx, size = said.frames * said.loops * len(said.chirps), said.receivers, said.size
     parts = 1 if d.sampling == "real" else 2
-    content = _read(file)
-    _fits(file, said, len(content), 2 * parts * rows * num_rx * size)
-    words = np.frombuffer(content, "<i2").astype(np.float32)
+    content, wanted = _read(file), 2 * parts * rows * num_rx * size
+    _fits(file, said, len(content), wanted)
+    words = np.frombuffer(content, "<i2", wanted // 2).astype(np.float32)
     shape = (rows, size, num_rx) if d.interleaved else (rows, num_rx, size)
     if parts == 1:
         flat = words.reshape(shape).astype(np.complex64)
@@ -218,7 +259,7 @@ def _joined(first: np.ndarray, second: np.ndarray, d: Description) -> np.ndarray
 # ---- NumPy and SigMF
 
 
-def _numpy(file: Path, d: Description) -> Capture:
+def _numpy(file: Path, d: Description) -> Recording:
     try:
         array = np.load(io.BytesIO(_read(file)), allow_pickle=False)
     except (OSError, EOFError, MemoryError, SyntaxError, TokenError, *BAD_DATA):
@@ -230,7 +271,7 @@ def _numpy(file: Path, d: Description) -> Capture:
     return _ordered(file, array, d, "numpy")
 
 
-def _sigmf(file: Path, d: Description) -> Capture:
+def _sigmf(file: Path, d: Description) -> Recording:
     base = _without_end(file)
     meta, data = (base.with_name(base.name + end) for end in (".sigmf-meta", ".sigmf-data"))
     try:
@@ -239,7 +280,8 @@ def _sigmf(file: Path, d: Description) -> Capture:
     except BAD_DATA as problem:
         raise CaptureError(f"{meta}: is no SigMF description ({shortly(problem)})") from None
     if "isac_rt:waveform" in info:
-        return Capture(cube=read_sigmf(base), source={"file": file.name, "format": "sigmf"})
+        whole = Capture(cube=read_sigmf(base), source={"file": file.name, "format": "sigmf"})
+        return 1, lambda _: whole
     if kind not in _SIGMF_TYPES:
         raise CaptureError(
             f"{meta}: samples of type {kind} are not read; r or c with f32, f64, i16, u16, i32 or "
@@ -331,8 +373,8 @@ def _unwrapped(values: np.ndarray, d: Description) -> np.ndarray:
     return np.where(values >= 32768, values - 65536.0, values) if d.wrapped else values
 
 
-def _ordered(file: Path, array: np.ndarray, d: Description, kind: str) -> Capture:
-    """The frame of an array whose axes the description names."""
+def _ordered(file: Path, array: np.ndarray, d: Description, kind: str) -> Recording:
+    """The frames of an array whose axes the description names."""
     said = _complete(file, d)
     sizes = {
         "frame": said.frames,
@@ -397,12 +439,19 @@ def _read(file: Path, most: int = MOST_BYTES) -> bytes:
 
 
 def _fits(file: Path, d: _Complete, found: int, wanted: int) -> None:
-    if found != wanted:
+    """Refuse a file that is too short, or holds more frames than the description states. A frame
+    that the recording's end cut off is left out."""
+    each = wanted // d.frames
+    whole, rest = divmod(found, each)
+    if whole != d.frames:
+        offer = f"state frames: {whole}" if whole else "the file holds no whole frame; correct it"
         raise CaptureError(
             f"{file}: has {found} bytes, the description asks for {wanted}: {d.frames} frames x "
             f"{d.loops} loops x {len(d.chirps)} chirps x {d.receivers} receivers x {d.size} "
-            f"samples of {2 if d.sampling == 'real' else 4} bytes; correct the description"
+            f"samples of {2 if d.sampling == 'real' else 4} bytes; {offer}"
         )
+    if rest:
+        _LOG.warning("%s: %d bytes behind the last whole frame are left out", file, rest)
 
 
 def _same(file: Path, what: str, found: int, stated: int | None) -> None:
@@ -412,10 +461,13 @@ def _same(file: Path, what: str, found: int, stated: int | None) -> None:
         )
 
 
-def _framed(file: Path, d: _Complete, frames: np.ndarray, kind: str) -> Capture:
-    """The chosen frame of (frames, chirps, L_rx, N)."""
-    chirps = frames[d.frame].transpose(1, 0, 2)[None]
-    return _capture(file, d, chirps, d.antennas(), kind)
+def _framed(file: Path, d: _Complete, frames: np.ndarray, kind: str) -> Recording:
+    """The frames of (frames, chirps, L_rx, N)."""
+
+    def frame(k: int) -> Capture:
+        return _capture(file, d, frames[k].transpose(1, 0, 2)[None], d.antennas(), kind)
+
+    return len(frames), frame
 
 
 def waveform_described(d: Description) -> Waveform:
@@ -468,7 +520,7 @@ def _capture(
     )
 
 
-_READERS: dict[str, Callable[[Path, Description], Capture]] = {
+_READERS: dict[str, Callable[[Path, Description], Recording]] = {
     "ti_calibration": _ti_calibration,
     "dca1000": _dca1000,
     "numpy": _numpy,

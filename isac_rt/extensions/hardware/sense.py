@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +19,13 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.sense import describe
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections, Reception
+from isac_rt.track.filter import Ambiguity
+from isac_rt.track.settings import Tracking
+from isac_rt.track.tracker import Tracker, in_plane
+from isac_rt.world.swarm import Pose
+
+AT_ORIGIN = Pose(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3))
+"""A board that stands still and looks along y."""
 
 
 def sense(capture: Capture, settings: Receivers) -> Reception:
@@ -50,6 +58,60 @@ def sense(capture: Capture, settings: Receivers) -> Reception:
         farthest = cube.waveform.num_samples / 2 * cube.waveform.range_cell(2)
         detections = detections.select(detections.range < farthest)
     return replace(found, detections=detections)
+
+
+def sense_all(
+    captures: Sequence[Capture],
+    settings: Receivers,
+    tracking: Tracking,
+    interval: float | None,
+    report: Callable[[int, int], None] = lambda done, total: None,
+) -> xr.Dataset:
+    """Detect in all frames of a recording and track from frame to frame, as a terminal at rest.
+
+    Parameters
+    ----------
+    interval : from frame to frame [s]; None: detections alone
+
+    Returns
+    -------
+    As `as_dataset`, with the map of the last frame, `det_frame`, and variables `track_*` in the
+    axes of the board (x to the right, y ahead, z up)
+
+    Raises
+    ------
+    CaptureError  As `sense`.
+    """
+    tracker = Tracker(tracking, Ambiguity.of(captures[0].cube.waveform, 2))
+    found, tracks = [], []
+    for k, capture in enumerate(captures):
+        report(k, len(captures))
+        found.append(sense(capture, settings))
+        if interval is not None:
+            tracker.predict(k * interval)
+            tracker.update(in_plane(found[-1].detections), AT_ORIGIN)
+        tracks.append(tracker.snapshot(AT_ORIGIN))
+    report(len(captures), len(captures))
+    every = Detections.joined([one.detections for one in found])
+    out = as_dataset(replace(found[-1], detections=every))
+    of = {"units": "1", "long_name": "frame"}
+    counts = [len(one.detections) for one in found]
+    out["det_frame"] = ("detection", np.repeat(np.arange(len(found)), counts), of)
+    out["track_frame"] = ("track", np.repeat(np.arange(len(found)), [len(t) for t in tracks]), of)
+    states = ("track", "component"), np.concatenate([t.mean for t in tracks])
+    for name, (dims, values), unit, meaning in (
+        ("id", ("track", np.concatenate([t.ids for t in tracks])), "1", "number of the track"),
+        ("state", states, "m, m/s", "position and velocity from the board"),
+        ("range", ("track", np.concatenate([t.range for t in tracks])), "m", "range, one way"),
+        (
+            "confirmed",
+            ("track", np.concatenate([t.confirmed for t in tracks])),
+            "1",
+            "whether enough detections confirm it",
+        ),
+    ):
+        out[f"track_{name}"] = (dims, values, {"units": unit, "long_name": meaning})
+    return out
 
 
 def _at_rest(capture: Capture, found: Detections) -> Detections:
