@@ -378,7 +378,7 @@ class Document:
             between nodes those that read none that is malformed.
         """
         lines: dict[Any, str] = {}
-        without = [problem.keys[0][:-1] for problem in tables]
+        without = [key for problem in tables if (key := problem.keys[0][:-1])]
         broken = {str(key[0]) for key in without}
         try:
             tree = root.model_validate(self.data)

@@ -84,8 +84,8 @@ def files(tmp_path):
 
 def test_both_files_say_what_the_board_does(files):
     """Numbers by hand: 70 MHz/us over 57.14 us, 256 samples at 5.209 Msps from 7 us on,
-    transmitters 0 and 2 in turn, 16 loops in 100 ms. Planted bugs: masks taken for numbers; slope and idle time
-    exchanged; the period in seconds."""
+    transmitters 0 and 2 in turn, 16 loops in 100 ms. Planted bugs: masks taken for numbers; slope
+    and idle time exchanged; the period in seconds."""
     board = read_board(files / "b.cfg")
     assert board == read_board(files / "b.mmwave.json")
     assert (board.start_hz, board.slope, board.rate) == (77e9, pytest.approx(70e12), 5.209e6)
