@@ -180,7 +180,9 @@ def receive(
     receivers: Annotated[
         Path | None,
         typer.Option(
-            metavar="YAML", help="Keys of a scenario's `receivers`.", show_default="theirs"
+            metavar="FILE",
+            help="YAML with keys of a scenario's `receivers`.",
+            show_default="defaults of the scenario",
         ),
     ] = None,
 ) -> None:

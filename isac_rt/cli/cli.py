@@ -106,7 +106,10 @@ def _options(
     version: Annotated[
         bool,
         typer.Option(
-            "--version", callback=_print_versions, is_eager=True, help="Print the versions and end."
+            "--version",
+            callback=_print_versions,
+            is_eager=True,
+            help="Print the versions and exit.",
         ),
     ] = False,
 ) -> None:

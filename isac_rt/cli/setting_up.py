@@ -67,7 +67,8 @@ def new(
         Path | None, typer.Option(metavar="FILE", help="Heights of the ground, a GeoTIFF.")
     ] = None,
     formation: Annotated[
-        Shape | None, typer.Option(help="Targets abreast, in a column, or in two that cross.")
+        Shape | None,
+        typer.Option(help="Targets abreast, in one column, or in two crossing columns."),
     ] = None,
     uavs: Annotated[
         int | None, typer.Option(min=1, max=40, help="Targets of the formation.", show_default="10")

@@ -35,7 +35,9 @@ def run(
     frames: Annotated[
         int | None, typer.Option(help="Frames to simulate.", show_default="the scenario's")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed.", show_default="the scenario's")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of all randomness.", show_default="the scenario's")
+    ] = None,
     snapshots: Annotated[
         int, typer.Option(min=1, help="Frames whose maps and paths are kept.")
     ] = 3,
@@ -439,8 +441,8 @@ def export(
             "--as",
             metavar="FORMAT",
             help="csv: tables; mat: MATLAB; pcd: point clouds; glb: 3-D scene; stonesoup: "
-            "detections. IF samples of all frames and links: npy, mat_samples, sigmf, or bin, a "
-            "DCA1000's.",
+            "detections. IF samples of all frames and links: npy, mat_samples, sigmf, or bin "
+            "(raw data of a DCA1000).",
         ),
     ],
     out: Annotated[

@@ -171,7 +171,10 @@ def _validate(cases: list[Any]) -> list[Any]:
 def bench(
     stages: Annotated[
         list[str] | None,
-        typer.Argument(metavar="STAGE", help="Stages to run, from synthesis to hermespy."),
+        typer.Argument(
+            metavar="STAGE",
+            help="Stages: synthesis, receive, trace, clutter, end-to-end, dataset, hermespy.",
+        ),
     ] = None,
     quick: Quick = False,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of tables and figures.")] = Path(

@@ -43,7 +43,7 @@ def sweep(
     ] = False,
     status: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Print the progress of the sweep in DIR and end."),
+        typer.Option(metavar="DIR", help="Print the progress of the sweep in DIR and exit."),
     ] = None,
 ) -> None:
     """Run a parameter sweep. After a stop the same command computes the missing points."""

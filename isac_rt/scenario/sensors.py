@@ -1,7 +1,7 @@
 """Common FMCW sensors: what a scenario's `sensor` says of `radio`, `array` and `noise`.
 
-The table "Where the numbers come from" of docs/radar.md names the source of each number, and says
-which are assumed and which chirps are our choice. Arrays and antenna gains are those of the makers'
+docs/sensors.md names the source of each number, and says which are assumed and which chirps are our
+choice. Arrays and antenna gains are those of the makers'
 evaluation boards.
 """
 
