@@ -230,18 +230,20 @@ def _recorded(
     """Frames of a file with a board's calibration applied, and the time between them [s]."""
     from isac_rt.extensions.hardware.calibrate import apply, load_calibration
     from isac_rt.extensions.hardware.description import load_description
-    from isac_rt.extensions.hardware.readers import Corrected, import_frames
+    from isac_rt.extensions.hardware.readers import Frames, import_frames
 
     if not _is_imported(file, description):
         return [_calibrated(_opened(file, description), calibration)], None
     said = None if description is None else load_description(description)
     with working("reading the samples"):
         frames = import_frames(file, said)
-    if calibration is not None:
-        found = load_calibration(calibration)
-        frames = Corrected(frames, lambda capture: apply(found, capture))
-    interval = None if said is None else said.frame_interval_ms
-    return frames, None if interval is None else interval * 1e-3
+    interval = None
+    if said is not None and said.frame_interval_ms is not None:
+        interval = said.frame_interval_ms * 1e-3
+    if calibration is None:
+        return frames, interval
+    found = load_calibration(calibration)
+    return Frames(len(frames), lambda k: apply(found, frames[k])), interval
 
 
 def _imported(file: Path, description: Path | None, format: str | None) -> Capture:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import logging
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -45,7 +44,6 @@ _SIGMF_TYPES = {
     for end, mark in (("_le", "<"), ("_be", ">"))
 } | {f"{part}{kind}8": f"{kind}1" for part in "rc" for kind in "iu"}
 """Numpy's names of a number of each; of a complex sample there are two."""
-_LOG = logging.getLogger(__name__)
 Recording = tuple[int, Callable[[int], Capture]]
 """Frames of a file, and how each is made."""
 MOST_AMPLITUDE = 1e12
@@ -84,48 +82,40 @@ def import_frames(
             f"{file}: a name that ends in {file.suffix or 'nothing'} does not tell the format; "
             f"state one of {', '.join(_READERS)}"
         )
-    return _Frames(file, _READERS[kind](file, said))
+    count, make = _READERS[kind](file, said)
+    return Frames(count, lambda k: _checked(file, make(k)))
 
 
-class _Frames(Sequence[Capture]):
-    """Frames of a file, each made and checked when it is taken."""
+class Frames(Sequence[Capture]):
+    """Frames of a file, each made when it is taken."""
 
-    def __init__(self, file: Path, read: Recording) -> None:
-        self._file, self._read = file, read
+    def __init__(self, count: int, make: Callable[[int], Capture]) -> None:
+        self._count, self._make = count, make
 
     def __len__(self) -> int:
-        return self._read[0]
+        return self._count
 
     def __getitem__(self, k: Any) -> Any:
-        if not -len(self) <= k < len(self):
+        if not -self._count <= k < self._count:
             raise IndexError(k)
-        found, file = self._read[1](int(k)), self._file
-        bad = int((~np.isfinite(found.cube.samples)).sum())
-        if bad:
-            raise CaptureError(
-                f"{file}: {bad} of {found.cube.samples.size} samples are not finite; leave such "
-                "chirps out"
-            )
-        largest = float(np.abs(found.cube.samples).max(initial=0.0))
-        if largest > MOST_AMPLITUDE:
-            raise CaptureError(
-                f"{file}: the largest sample is {largest:g}, at most {MOST_AMPLITUDE:g} can be "
-                "read; scale them to counts of the converter or volts"
-            )
-        return found
+        return self._make(int(k))
 
 
-class Corrected(Sequence[Capture]):
-    """Frames with a correction applied when they are taken."""
-
-    def __init__(self, frames: Sequence[Capture], correct: Callable[[Capture], Capture]) -> None:
-        self._frames, self._correct = frames, correct
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, k: Any) -> Any:
-        return self._correct(self._frames[k])
+def _checked(file: Path, found: Capture) -> Capture:
+    """A frame whose samples are finite and of a converter's size."""
+    bad = int((~np.isfinite(found.cube.samples)).sum())
+    if bad:
+        raise CaptureError(
+            f"{file}: {bad} of {found.cube.samples.size} samples are not finite; leave such chirps "
+            "out"
+        )
+    largest = float(np.abs(found.cube.samples).max(initial=0.0))
+    if largest > MOST_AMPLITUDE:
+        raise CaptureError(
+            f"{file}: the largest sample is {largest:g}, at most {MOST_AMPLITUDE:g} can be read; "
+            "scale them to counts of the converter or volts"
+        )
+    return found
 
 
 # ---- TI's calibration
@@ -231,9 +221,9 @@ def _dca1000(file: Path, d: Description) -> Recording:
     said = _complete(file, d)
     rows, num_rx, size = said.frames * said.loops * len(said.chirps), said.receivers, said.size
     parts = 1 if d.sampling == "real" else 2
-    content, wanted = _read(file), 2 * parts * rows * num_rx * size
-    _fits(file, said, len(content), wanted)
-    words = np.frombuffer(content, "<i2", wanted // 2).astype(np.float32)
+    content = _read(file)
+    _fits(file, said, len(content), 2 * parts * rows * num_rx * size)
+    words = np.frombuffer(content, "<i2").astype(np.float32)
     shape = (rows, size, num_rx) if d.interleaved else (rows, num_rx, size)
     if parts == 1:
         flat = words.reshape(shape).astype(np.complex64)
@@ -439,19 +429,20 @@ def _read(file: Path, most: int = MOST_BYTES) -> bytes:
 
 
 def _fits(file: Path, d: _Complete, found: int, wanted: int) -> None:
-    """Refuse a file that is too short, or holds more frames than the description states. A frame
-    that the recording's end cut off is left out."""
+    """Refuse a file of another size. A recording that was cut off within a frame cannot be told
+    from a wrong description, so neither is read."""
+    if found == wanted:
+        return
     each = wanted // d.frames
     whole, rest = divmod(found, each)
-    if whole != d.frames:
-        offer = f"state frames: {whole}" if whole else "the file holds no whole frame; correct it"
-        raise CaptureError(
-            f"{file}: has {found} bytes, the description asks for {wanted}: {d.frames} frames x "
-            f"{d.loops} loops x {len(d.chirps)} chirps x {d.receivers} receivers x {d.size} "
-            f"samples of {2 if d.sampling == 'real' else 4} bytes; {offer}"
-        )
-    if rest:
-        _LOG.warning("%s: %d bytes behind the last whole frame are left out", file, rest)
+    offer = f"state frames: {whole}" if whole and not rest else "correct the description"
+    if whole and rest:
+        offer += f", or cut the file off at {whole * each} bytes, its last whole frame"
+    raise CaptureError(
+        f"{file}: has {found} bytes, the description asks for {wanted}: {d.frames} frames x "
+        f"{d.loops} loops x {len(d.chirps)} chirps x {d.receivers} receivers x {d.size} "
+        f"samples of {2 if d.sampling == 'real' else 4} bytes; {offer}"
+    )
 
 
 def _same(file: Path, what: str, found: int, stated: int | None) -> None:

@@ -198,13 +198,11 @@ def recording(tmp_path, frames=6, behind=0):
     return ["receive", str(tmp_path / "a.bin"), "--description", str(tmp_path / "a.yaml")]
 
 
-def test_all_frames_of_a_recording_are_tracked(tmp_path, caplog):
+def test_all_frames_of_a_recording_are_tracked(tmp_path):
     """Each frame's range is 9 m less what was flown (a tenth of a cell of 0.29 m), and one track is
-    confirmed and follows; bytes of a frame that was cut off are left out and said. Planted
-    bugs: the first frame for all; the interval in seconds."""
-    command = recording(tmp_path, behind=1000)
+    confirmed and follows. Planted bugs: the first frame for all; the interval in seconds."""
+    command = recording(tmp_path)
     assert main([*command, "--out", str(tmp_path / "out")]) == 0
-    assert "1000 bytes behind the last whole frame" in caplog.text
     d = xr.open_dataset(tmp_path / "out" / "reception.nc", engine="h5netcdf")
     middle = 0.05 * np.arange(6) + 16 * AGAIN
     for frame in range(6):
@@ -215,6 +213,14 @@ def test_all_frames_of_a_recording_are_tracked(tmp_path, caplog):
     assert last.sum() == 1
     assert d.track_state.values[last][0, 1] == pytest.approx(9.0 - 3.0 * middle[5], abs=0.05)
     assert d.track_state.values[last][0, 4] == pytest.approx(-3.0, abs=0.1)
+
+
+def test_a_frame_that_was_cut_off_is_refused(tmp_path, capsys):
+    """Where to cut is said: six frames of 32 x 4 x 64 samples of 4 bytes. Planted bug: rows read
+    up to there without a word."""
+    command = recording(tmp_path, behind=1000)
+    assert main([*command, "--out", str(tmp_path / "out")]) == 2
+    assert "cut the file off at 196608 bytes" in capsys.readouterr().err
 
 
 def test_the_number_of_frames_is_offered(tmp_path, capsys):
