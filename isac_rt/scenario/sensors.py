@@ -11,6 +11,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from isac_rt.frame.boards import TI_TX
+
 Sensor = Literal[
     "awr1642",
     "awr1843",
@@ -24,7 +26,7 @@ Sensor = Literal[
 BoardFile = Annotated[str, Field(pattern=r"\.(cfg|json)$")]
 
 _TI_BOARD = {
-    "tx": {"shape": "positions", "positions": [[0.0, 0.0], [1.0, 0.5], [2.0, 0.0]]},
+    "tx": {"shape": "positions", "positions": [list(place) for place in TI_TX]},
     "rx": {"shape": "linear", "columns": 4},
 }
 """TI's AWR1843BOOST and IWR6843ISK: four receivers half a wavelength apart, two transmitters two
@@ -157,7 +159,12 @@ def with_sensor(stated: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(name, str) or name.lower() not in SENSORS:
         return out
     out["sensor"] = name.lower()
-    said = SENSORS[name.lower()]
+    return completed(out, SENSORS[name.lower()])
+
+
+def completed(stated: dict[str, Any], said: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return settings with what a sensor says under the keys that are stated."""
+    out = dict(stated)
     for key, values in said.items():
         own = stated.get(key, {})
         if isinstance(own, dict):

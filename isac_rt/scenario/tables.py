@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from isac_rt.frame.boards import BOARD_FILES, BoardFileError, read_board
+from isac_rt.scenario.sensors import completed
 from isac_rt.settings import Key, Problem
 from isac_rt.world.settings import City
 
@@ -312,12 +313,8 @@ def _with_board(tree: dict[str, Any], folder: Path, faults: list[Problem] | None
             raise TableError(("sensor",), str(problem)) from None
         faults.append(Problem((("sensor",),), str(problem)))
         return {key: value for key, value in tree.items() if key != "sensor"}
-    out = copy.deepcopy(tree)
+    out = completed(copy.deepcopy(tree), board.scenario())
     del out["sensor"]
-    for key, values in board.scenario().items():
-        own = out.get(key, {})
-        if isinstance(own, dict):
-            out[key] = {**values, **own}
     out.setdefault("frame_interval_s", board.period)
     return out
 
