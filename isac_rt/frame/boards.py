@@ -17,8 +17,8 @@ MOST_BYTES = 1_000_000
 MOST_CHIRPS = 512
 """Chirp configurations of a device."""
 Sampling = Literal["complex_1x", "complex_2x", "real"]
-_SAMPLINGS: tuple[Sampling, ...] = ("real", "complex_1x", "complex_2x", "complex_1x")
-"""By the number that the files state; 3 is complex_1x with Q first."""
+_SAMPLINGS: tuple[Sampling, ...] = ("real", "complex_1x", "complex_2x")
+"""By the number that the files state. A further one, 3, is TI's pseudo real, which is not read."""
 TI_TX = ((0.0, 0.0), (1.0, 0.5), (2.0, 0.0))
 """Transmitters of AWR1843BOOST and IWR6843ISK [wavelengths], right and up; four receivers stand
 half a wavelength apart."""
@@ -278,7 +278,7 @@ def _of_cfg(file: Path, text: str) -> Board:
     at, words = one("channelCfg", 2)
     receivers = int(at.number(words[0], "the receivers' mask", 1, 65535)).bit_count()
     at, words = one("adcCfg", 2)
-    sampling = _SAMPLINGS[int(at.number(words[1], "the output format", 0, 3))]
+    sampling = _SAMPLINGS[int(at.number(words[1], "the output format", 0, 2))]
     buffers = all_of("adcbufCfg", 4)
     interleaved = None
     if buffers:
@@ -340,7 +340,7 @@ def _of_json(file: Path, text: str) -> Board:
         value("rlFrameCfg_t", "framePeriodicity_msec", 1e-3, 1e5),
     )
     receivers = int(value("rlChanCfg_t", "rxChannelEn", 1, 65535)).bit_count()
-    sampling = _SAMPLINGS[int(value("fmt", "b2AdcOutFmt", 0, 3))]
+    sampling = _SAMPLINGS[int(value("fmt", "b2AdcOutFmt", 0, 2))]
     interleaved = None if order is None else order == 0
     if not chirps:
         raise BoardFileError(f"{file}: rlChirps is empty; give the board's whole configuration")

@@ -127,6 +127,7 @@ def test_a_description_and_a_scenario_have_its_chirp(files):
         ("chirpCfg 1 1", "chirpCfg 2 2", ": chirp 1 of the frame is configured 0 times"),
         ("1 1 0 0 0 0 0 4", "1 1 1 0 0 0 0 4", ": chirp 1 has another profile"),
         ("frameCfg", "%", ": has no frameCfg"),
+        ("adcCfg 2 1", "adcCfg 2 3", ":4: the output format is 3, it must be 0 to 2"),
     ],
 )
 def test_what_is_wrong_is_said_with_its_line(files, old, new, said):
