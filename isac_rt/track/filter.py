@@ -34,7 +34,8 @@ second to some seconds; with PX4's default limits of 3 m/s^2 and 4 m/s^3 one nee
 _ITERATIONS = 10
 ROUNDING = 1e-12
 """Of states of no deviation."""
-_POSITION = np.array([0, 2, 3])
+POSITION = np.array([0, 2, 3])
+"""Rows of a measurement that fix a place: range, u_x, u_z."""
 
 
 class Gaussian(NamedTuple):
@@ -362,7 +363,7 @@ def births(
     are not. The acceleration is zero with `acceleration_std` [m/s^2] per axis.
     """
     there = None if transmitter is None else transmitter.mean
-    mean = _resting(measurement, own, there)
+    mean = resting(measurement, own, there)
     off = measurement - measure(mean, own, there)
     near = wrapped(off, ambiguity)
     read = measurement + (near - off)
@@ -371,12 +372,12 @@ def births(
         period, shift = ambiguity
         far = read + np.sign(near[:, 1:2]) * [shift, -period, 0.0, 0.0]
         read, which = np.concatenate([read, far]), np.append(which, which)
-    mean = _resting(read, own, there)
+    mean = resting(read, own, there)
     H = jacobian(mean, own, there)
     speed = np.abs((read - measure(mean, own, there))[:, 1])
     limit = BIRTH_SPEED_DEVIATIONS * BIRTH_SPEED_STD * np.linalg.norm(H[:, 1, 3:6], axis=1)
     fits = (np.arange(len(read)) < len(measurement)) | (speed <= limit)
-    J = H[:, _POSITION, :3]
+    J = H[:, POSITION, :3]
     rho = np.linalg.norm(mean[:, :3] - own.position, axis=1)
     in_metres = J * np.stack([np.ones_like(rho), rho, rho], axis=1)[..., None]
     some = np.flatnonzero(fits & np.isfinite(J).all(axis=(1, 2)) & np.isfinite(read).all(axis=1))
@@ -384,7 +385,7 @@ def births(
     which, mean, read = which[some], mean[some], read[some]
     R = measurement_covariance(std[which], mean, transmitter)
     back = np.linalg.inv(J[some])
-    position = back @ R[:, _POSITION[:, None], _POSITION] @ np.swapaxes(back, 1, 2)
+    position = back @ R[:, POSITION[:, None], POSITION] @ np.swapaxes(back, 1, 2)
     near = np.trace(position, axis1=1, axis2=2) <= BIRTH_POSITION_STD_LIMIT**2
     which, mean, read, R, position = (a[near] for a in (which, mean, read, R, position))
     P = np.zeros((len(which), 9, 9))
@@ -394,7 +395,7 @@ def births(
     return which, _updated(Gaussian(mean, P), read, R, rate, own, there, UNAMBIGUOUS)
 
 
-def _resting(measurement: np.ndarray, own: Pose, transmitter: np.ndarray | None) -> np.ndarray:
+def resting(measurement: np.ndarray, own: Pose, transmitter: np.ndarray | None) -> np.ndarray:
     """States (Q, 9) of targets at rest where range and direction (Q, 4) place them, or NaN."""
     rho, _, u_x, u_z = measurement.T
     e = own.to_world(np.stack([u_x, np.sqrt(1 - u_x**2 - u_z**2), u_z], axis=1))

@@ -9,13 +9,12 @@ import pandas as pd
 import xarray as xr
 
 from isac_rt.storage import write_whole
-from isac_rt.track.filter import bistatic_distance, jacobian
+from isac_rt.track.filter import POSITION, jacobian, resting
 from isac_rt.world.swarm import Pose
 
 _COVARIANCE = ("xx", "xy", "xz", "yy", "yz", "zz")
 _UPPER = np.triu_indices(3)
-_MEASURED = np.array([0, 2, 3])
-"""Rows of a measurement that fix a place: range, u_x, u_z."""
+_MEASURED = "range", "velocity", "u_x", "u_z"
 
 
 def point_cloud(dataset: xr.Dataset) -> pd.DataFrame:
@@ -62,27 +61,19 @@ def point_cloud(dataset: xr.Dataset) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+@np.errstate(invalid="ignore", divide="ignore")  # beyond the view, in the place of a terminal
 def _place(
     d: xr.Dataset, k: int, own: Pose, transmitter: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Place (3,) and covariance (3, 3) of a detection; None where it has none: outside the field of
     view, on the line of sight, or with a deviation that is infinite."""
-    u_x, u_z, rho = (float(d[f"det_{name}"].values[k]) for name in ("u_x", "u_z", "range"))
-    std = np.array([float(d[f"det_{name}_std"].values[k]) for name in ("range", "u_x", "u_z")])
-    if not (u_x**2 + u_z**2 < 1 and np.isfinite(std).all()):
-        return None
-    e = own.to_world(np.array([u_x, np.sqrt(1 - u_x**2 - u_z**2), u_z]))
-    is_reference = bool(d.det_is_reference.values[k])
-    if is_reference:
+    if d.det_is_reference.values[k]:
         transmitter = None
-    if transmitter is not None:
-        rho = float(bistatic_distance(np.array(rho), transmitter[:3] - own.position, e))
-    if not rho > 0:
-        return None
-    state = np.zeros(6)
-    state[:3] = own.position + rho * e
-    J = jacobian(state, own, transmitter)[_MEASURED, :3]
-    if not np.isfinite(J).all() or np.linalg.cond(J) > 1 / np.finfo(float).eps:
+    measured = np.array([float(d[f"det_{name}"].values[k]) for name in _MEASURED])
+    std = np.array([float(d[f"det_{name}_std"].values[k]) for name in _MEASURED])[POSITION]
+    state = resting(measured[None], own, transmitter)[0]
+    J = jacobian(state, own, transmitter)[POSITION, :3]
+    if not np.isfinite([*J.flat, *std]).all() or np.linalg.cond(J) > 1 / np.finfo(float).eps:
         return None
     back = np.linalg.inv(J)
     return state[:3], back @ np.diag(std**2) @ back.T

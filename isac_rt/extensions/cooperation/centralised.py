@@ -29,6 +29,7 @@ from isac_rt.extensions.cooperation.fusion import (
 )
 from isac_rt.plain import Stateful
 from isac_rt.track.filter import (
+    POSITION,
     STD_FLOOR,
     Ambiguity,
     Gaussian,
@@ -57,7 +58,6 @@ ERROR_TIME = 10.0
 minutes. A clock's error stays, and grows as scans state."""
 MOST_LATE = 0.5
 """Detections that come later count for nothing [s]."""
-_POSITION = np.array([0, 2, 3])
 
 
 @dataclass(frozen=True)
@@ -451,9 +451,9 @@ class CentralisedTracker(Stateful):
         size = len(joint.mean)
         H = np.zeros((4, size))
         view.errors_into(H, made.mean, own, sender)
-        J = jacobian(made.mean, own, sender)[_POSITION, :3]
+        J = jacobian(made.mean, own, sender)[POSITION, :3]
         D = np.zeros((UAV_STATES, size))
-        D[:3] = -np.linalg.solve(J, H[_POSITION])
+        D[:3] = -np.linalg.solve(J, H[POSITION])
         P = np.zeros((size + UAV_STATES, size + UAV_STATES))
         P[:size, :size] = joint.covariance
         P[size:, :size] = D @ joint.covariance
