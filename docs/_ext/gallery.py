@@ -23,20 +23,16 @@ def draw(text: str, words: list[str], file: Path) -> None:
     import matplotlib.pyplot as plt
 
     import isac_rt as irt
-    from isac_rt.views.render import view_scene, write_view
+    from isac_rt.cli.cli import main
 
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "data").symlink_to(SCENES / "data")
         (Path(folder) / "scene.yaml").write_text(text)
-        scenario = irt.load(Path(folder) / "scene.yaml")
         what, *arguments = words
         if what == "view":
-            setup = irt.prepare(scenario)
-            last = setup.timetable.epoch(scenario.frames - 1)
-            times = [last * k / 30 for k in range(31)]
-            paths = irt.trace(scenario, 0, setup=setup)
-            write_view(view_scene(setup.city, setup.swarm, times, 0.0, paths, 1000, 560), file)
+            assert main(["view", f"{folder}/scene.yaml", "--out", str(file)]) == 0, text
             return
+        scenario = irt.load(Path(folder) / "scene.yaml")
         results = irt.run(scenario, snapshots=SNAPSHOTS, progress=False)
         axes = getattr(irt.Plots(results), what)(*arguments)
         axes.figure.savefig(file, dpi=110)

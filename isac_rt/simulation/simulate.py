@@ -99,21 +99,25 @@ def run(
     with followed(progress, scenario.frames) as report:
         run.fly(report, threads, resume)
     summary = run.summary()
-    materials = {m.name: vars(m) for m in run.setup.city.materials}
-    attributes = {
+    dataset = run.recorder.dataset().assign_attrs(
+        provenance(scenario) | _attributes(run.setup, summary)
+    )
+    return Results(dataset, summary, scenario, samples)
+
+
+def _attributes(setup: Setup, summary: Mapping[str, Any]) -> dict[str, str]:
+    """Attributes of a run's dataset, as JSON."""
+    out = {
         "fidelity": summary["fidelity"],
         "city": summary["city"],
         "materials": {
-            name: {key: value for key, value in entry.items() if key != "name"}
-            for name, entry in materials.items()
+            m.name: {key: value for key, value in vars(m).items() if key != "name"}
+            for m in setup.city.materials
         },
-        "link_budget": [vars(row) for row in link_budgets(run.setup)],
-        "coverage": asdict(run.setup.coverage),
+        "link_budget": [vars(row) for row in link_budgets(setup)],
+        "coverage": asdict(setup.coverage),
     }
-    dataset = run.recorder.dataset().assign_attrs(
-        provenance(scenario) | {name: json.dumps(value) for name, value in attributes.items()}
-    )
-    return Results(dataset, summary, scenario, samples)
+    return {name: json.dumps(value) for name, value in out.items()}
 
 
 def summarise(

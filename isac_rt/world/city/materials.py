@@ -402,6 +402,11 @@ def _base(use: MaterialUse, carrier_frequency: float, change: MaterialOverride |
     return material
 
 
+def _by_name(changes: Mapping[str, MaterialOverride]) -> dict[str, MaterialOverride]:
+    """Changes by the names that the table gives materials."""
+    return {canonical_name(name) or name: change for name, change in changes.items()}
+
+
 def believed_materials(
     materials: Sequence[Material], changes: Mapping[str, MaterialOverride]
 ) -> tuple[Material, ...]:
@@ -411,7 +416,7 @@ def believed_materials(
     ------
     CityError  If the city has no such material.
     """
-    wanted = {canonical_name(name) or name: change for name, change in changes.items()}
+    wanted = _by_name(changes)
     names = {m.name for m in materials}
     for name in wanted.keys() - names:
         raise CityError(
@@ -447,7 +452,7 @@ def resolve_materials(
     ------
     CityError  If a name is unknown.
     """
-    changes = {canonical_name(name) or name: change for name, change in overrides.items()}
+    changes = _by_name(overrides)
     found: dict[MaterialUse, int] = {}
     materials: list[Material] = []
     index = []
