@@ -68,10 +68,9 @@ class Scenario(Node):
     """Time from the start of a frame to the start of the next [s], at least a frame long. null, the
     default: frames follow each other without a pause."""
     sensor: Sensor | BoardFile | None = None
-    """A plain FMCW sensor by name, or a board's configuration (`.cfg`, `.mmwave.json`), whose
-    `radio`, `array` and `noise` the keys stated there override: `awr1642`, `awr1843`, `awr2243`,
-    `awr2243_cascade`, `awr2944` and `iwr1443` at 77 GHz, `iwr6843` at 60 GHz, `bgt24mtr12` at
-    24 GHz. null, the default: none."""
+    """A plain FMCW sensor: `awr1642`, `awr1843`, `awr2243`, `awr2243_cascade`, `awr2944`,
+    `iwr1443`, `iwr6843`, `bgt24mtr12`, or a board's `.cfg` or `.mmwave.json`. It fills in `radio`,
+    `array` and `noise`, which keys stated there override. null, the default: none."""
     radio: Radio = Radio()
     """The chirp and the frame. By default the paper's."""
     array: Array = Array()

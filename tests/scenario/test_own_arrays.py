@@ -122,7 +122,13 @@ def test_sensors_are_consistent_and_can_be_overridden(tmp_path, name):
     (tmp_path / "scene.yaml").write_text(scene)
     s = load(tmp_path / "scene.yaml", [f"sensor={name}", "noise.noise_figure_db=9"])
     assert s == load(tmp_path / "scene.yaml", [f"sensor={name.upper()}", "noise.noise_figure_db=9"])
-    low, high = {"a": (76e9, 81e9), "i": (60e9, 64e9), "b": (24e9, 24.25e9)}[name[0]]
+    bands = {
+        "awr": (76e9, 81e9),
+        "iwr1": (76e9, 81e9),
+        "iwr6": (60e9, 64e9),
+        "bgt": (24e9, 24.25e9),
+    }
+    low, high = next(band for start, band in bands.items() if name.startswith(start))
     assert low <= s.radio.carrier_hz and s.radio.carrier_hz + s.radio.bandwidth_hz <= high
     assert (s.noise.noise_figure_db, s.radio.mode) == (9, "fmcw")
     assert s.noise.tx_power_dbm == SENSORS[name]["noise"]["tx_power_dbm"]
