@@ -170,13 +170,12 @@ class Scenes:
         """
         pose = self.pose(place, speed)
         local = replace(pose, position=pose.position - self.setup.city.origin)
-        seen = self.field.seen(LinkState(Link(place, place), self.epoch, local, local))
-        paths = self.field.paths(
-            LinkState(Link(place, place), self.epoch, local, local), self.setup.antennas
-        )
+        state = LinkState(Link(place, place), self.epoch, local, local)
+        seen, paths = self.field.seen(state), self.field.paths(state, self.setup.antennas)
+        mean = seen.magnitude * state.elements(self.setup.antennas, seen)
+        mean = mean[mean > 0]  # behind the antennas there is no path
         rng = generator(self.setup.scenario.seed, "amplitudes", place, draw)
         drawn = rng.standard_normal((len(paths), 2)) @ np.array([1, 1j]) / np.sqrt(2)
-        mean = paths.gain / self.field.cells.amplitude[seen.index]
         w = self.setup.waveform
         cell = self.noise * 2.25 / (w.num_samples * w.num_chirps)
         kept = self.amplitude**2 * np.abs(mean) ** 2 > cell * 10 ** (-LEFT_OUT_DB / 10)

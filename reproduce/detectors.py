@@ -157,7 +157,7 @@ def strengths(scenes: Scenes, place: str, speed: float, payload: Payload) -> np.
     known = _known(scenes, payload)
     power = accumulate(channel_maps(clean_spectrum(scenes.noisy([], place, "level"), known), known))
     level = noise_level(power, None, known.channels)
-    clutter = _expected(scenes, place, speed, None)
+    clutter = _expected(scenes, place, speed, Mistakes())
     expected = expected_power(clutter, known, known.waveform.num_delay_symbols)
     return 10 * np.log10(np.maximum(expected / level, 1e-6))
 
