@@ -285,11 +285,15 @@ class Document:
         self.places = reader.places
 
     def drop_removed(self, root: type[BaseModel]) -> None:
-        """Take out the keys and values of earlier versions that the nodes of `root` list."""
+        """Rename or take out the keys and values of earlier versions that the nodes of `root`
+        list."""
 
         def drop(tree: dict[str, Any], at: tuple[str, ...]) -> None:
             for name, value in list(tree.items()):
-                if _instead_of_removed(root, (*at, name), value) is not None:
+                instead = _instead_of_removed(root, (*at, name), value)
+                if instead in _names_allowed(root, at):
+                    tree[instead] = tree.pop(name)
+                elif instead is not None:
                     del tree[name]
                 elif isinstance(value, dict):
                     drop(value, (*at, name))
@@ -439,7 +443,8 @@ def _said(root: type[Node], key: Key, found: Any) -> str:
     kind = found["type"]
     instead = _instead_of_removed(root, key, found["input"])
     if instead is not None:
-        return f"removed in this version; {instead}"
+        renamed = instead in _names_allowed(root, key[:-1])
+        return f"renamed; write {instead}" if renamed else f"removed in this version; {instead}"
     if kind == "extra_forbidden":
         allowed = _names_allowed(root, key[:-1])
         near = difflib.get_close_matches(str(key[-1]), allowed, n=1, cutoff=0.6)

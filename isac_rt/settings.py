@@ -57,7 +57,8 @@ class Node(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     REMOVED: ClassVar[dict[str, str]] = {}
-    """What to write instead of keys ("rays") and values ("model: diffuse") of earlier versions."""
+    """New name of, or remedy for, keys ("rays") and values ("model: diffuse") of earlier
+    versions."""
     KEEPS_NULL: ClassVar[bool] = False
     """Whether a null that equals the default is written out, since a preset would fill it in."""
 

@@ -84,7 +84,7 @@ _IN_THE_MESH = ("clutter={model: field}",)
 _NO_CITY = (
     "receivers.clutter_detector=cfar",
     "receivers.update_false_alarm_rate=null",
-    "tracking.births=all",
+    "tracking.initiation=all",
 )
 _WIDE = (
     "city.street_width_m=34",

@@ -45,7 +45,7 @@ def scene(seed: int, index: int, frames: int) -> Scenario:
     of their own."""
     rng = generator(seed, "ghosts", index)
     changes = [f"frames={frames}", "frame_interval_s=0.05", "clutter.model=none"]
-    changes.append("receiver_preset=plain")  # births are to be tested here, not forbidden
+    changes.append("receiver_preset=plain")  # initiation is to be tested here, not forbidden
     for name, y in (("AT", -20.0), ("U1", rng.uniform(-10, 5)), ("PT1", rng.uniform(5, 20))):
         place = [rng.uniform(-6, 6), y, rng.uniform(6, 14)]
         speed = [

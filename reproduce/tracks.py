@@ -15,7 +15,7 @@ from isac_rt.frame.waveform import waveform_of
 from isac_rt.simulation.setup import swarm_of
 from isac_rt.track.filter import (
     Ambiguity,
-    birth,
+    initiate,
     measure,
     measurement_covariance,
     predict,
@@ -91,7 +91,7 @@ def on_grid(runs: Sequence[xr.Dataset], uavs: Sequence[str], every: int, observe
                 raw = np.round(found / step) * step
                 z = np.array([raw[0], raw[1], np.sin(raw[2]), 0.0])
                 if state is None:
-                    state = birth(z, std, own, acceleration_std=acceleration_std)
+                    state = initiate(z, std, own, acceleration_std=acceleration_std)
                 else:
                     state = predict(state, time - last, acceleration_std)
                     state = update(

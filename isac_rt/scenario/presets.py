@@ -21,7 +21,7 @@ PLAIN: dict[str, dict[str, Any]] = {
         "false_alarm_rate": 1e-6,
         "update_false_alarm_rate": None,
     },
-    "tracking": {"drop_after_s": None, "births": "all"},
+    "tracking": {"drop_after_s": None, "initiation": "all"},
 }
 
 
@@ -46,7 +46,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "clutter_detector": "angle_doppler",
             "update_false_alarm_rate": 1e-4,
         },
-        "tracking": {"drop_after_s": 0.36, "births": "unexplained"},
+        "tracking": {"drop_after_s": 0.36, "initiation": "unexplained"},
     },
 }
 """What each preset says of `receivers` and `tracking`, all of them of the same keys; of the rest

@@ -214,7 +214,7 @@ class Scenario(Node):
             self._rcs_problems,
             self._clutter_problems,
             self._detector_problems,
-            self._births_problems,
+            self._initiation_problems,
             self._calibration_problems,
             self._front_end_problems,
             self._self_calibration_problems,
@@ -572,14 +572,14 @@ class Scenario(Node):
                     f"add them or set {dotted(detector)} to cfar",
                 )
 
-    def _births_problems(self) -> Iterator[Problem]:
+    def _initiation_problems(self) -> Iterator[Problem]:
         sets: dict[Key, Tracking] = {("tracking",): self.tracking}
         sets |= {("compare", name, "tracking"): x.tracking for name, x in self.compare.items()}
         for at, one in sets.items():
             if one.needs_mesh and self.city is None:
-                births = (*at, "births")
-                said = f"{one.births} needs a city; add one or set {dotted(births)} to all"
-                yield Problem((births, ("city",)), said)
+                key = (*at, "initiation")
+                said = f"{one.initiation} needs a city; add one or set {dotted(key)} to all"
+                yield Problem((key, ("city",)), said)
 
     def _sensor_problems(self) -> Iterator[Problem]:
         if self.sensor is not None and self.sensor not in SENSORS:

@@ -1,5 +1,5 @@
 """The extended Kalman filter of one UAV: measurement model of both terminals, prediction, update
-and birth."""
+and initiation."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ STD_FLOOR = np.array([1e-3, 1e-2, 2e-4, 2e-4])
 """Smallest measurement standard deviations that are believed [m, m/s, 1, 1]. At high SNR the errors
 are not noise but the interpolation between cells, alike in successive frames: about 0.002 cell in
 range, 0.02 in velocity, 0.002 in angle."""
-BIRTH_SPEED_STD = 10.0
+INITIAL_SPEED_STD = 10.0
 """Per axis [m/s]: before its first detection a UAV is taken to stand still in the world, give or
 take this."""
-BIRTH_SPEED_DEVIATIONS = 3.0
+INITIAL_SPEED_DEVIATIONS = 3.0
 """A folded velocity is also read as its second nearest to standing still, up to this many of those
 deviations."""
-BIRTH_POSITION_STD_LIMIT = 100.0
+INITIAL_POSITION_STD_LIMIT = 100.0
 """A single detection that fixes the position worse than this [m] starts no track (near the line
 through both terminals a bistatic length says nothing about where the reflector is)."""
 MANOEUVRE_TIME = 1.0
@@ -320,7 +320,7 @@ def bistatic_distance(
     return np.asarray((length**2 - baseline @ baseline) / (2 * (length - ahead)))
 
 
-def birth(
+def initiate(
     measurement: np.ndarray,
     std: np.ndarray,
     own: Pose,
@@ -330,8 +330,8 @@ def birth(
     ambiguity: Ambiguity = UNAMBIGUOUS,
 ) -> Gaussian | None:
     """State after a first detection (4,) with deviations (4,); None where it does not fix a
-    position (`births`)."""
-    which, states = births(
+    position (`initiate_all`)."""
+    which, states = initiate_all(
         measurement[None],
         std[None],
         own,
@@ -343,7 +343,7 @@ def birth(
 
 
 @np.errstate(invalid="ignore", divide="ignore")  # in the very place of the transmitter
-def births(
+def initiate_all(
     measurement: np.ndarray,
     std: np.ndarray,
     own: Pose,
@@ -358,9 +358,9 @@ def births(
     Of what the `ambiguity` leaves open the two readings nearest to standing still count, the
     second ones after all first ones, unless they are faster than UAVs fly. The
     position from range and direction (front half-space), its covariance through the inverse
-    Jacobian; the velocity is zero in the world with `BIRTH_SPEED_STD` per axis, conditioned on the
-    measured rate: the component along the line of sight (or the bisector) is then known, the others
-    are not. The acceleration is zero with `acceleration_std` [m/s^2] per axis.
+    Jacobian; the velocity is zero in the world with `INITIAL_SPEED_STD` per axis, conditioned on
+    the measured rate: the component along the line of sight (or the bisector) is then known, the
+    others are not. The acceleration is zero with `acceleration_std` [m/s^2] per axis.
     """
     there = None if transmitter is None else transmitter.mean
     mean = resting(measurement, own, there)
@@ -375,7 +375,7 @@ def births(
     mean = resting(read, own, there)
     H = jacobian(mean, own, there)
     speed = np.abs((read - measure(mean, own, there))[:, 1])
-    limit = BIRTH_SPEED_DEVIATIONS * BIRTH_SPEED_STD * np.linalg.norm(H[:, 1, 3:6], axis=1)
+    limit = INITIAL_SPEED_DEVIATIONS * INITIAL_SPEED_STD * np.linalg.norm(H[:, 1, 3:6], axis=1)
     fits = (np.arange(len(read)) < len(measurement)) | (speed <= limit)
     J = H[:, POSITION, :3]
     rho = np.linalg.norm(mean[:, :3] - own.position, axis=1)
@@ -386,10 +386,10 @@ def births(
     R = measurement_covariance(std[which], mean, transmitter)
     back = np.linalg.inv(J[some])
     position = back @ R[:, POSITION[:, None], POSITION] @ np.swapaxes(back, 1, 2)
-    near = np.trace(position, axis1=1, axis2=2) <= BIRTH_POSITION_STD_LIMIT**2
+    near = np.trace(position, axis1=1, axis2=2) <= INITIAL_POSITION_STD_LIMIT**2
     which, mean, read, R, position = (a[near] for a in (which, mean, read, R, position))
     P = np.zeros((len(which), 9, 9))
-    P[:] = np.diag([0.0] * 3 + [BIRTH_SPEED_STD**2] * 3 + [acceleration_std**2] * 3)
+    P[:] = np.diag([0.0] * 3 + [INITIAL_SPEED_STD**2] * 3 + [acceleration_std**2] * 3)
     P[:, :3, :3] = (position + np.swapaxes(position, 1, 2)) / 2
     rate = np.array([1])
     return which, _updated(Gaussian(mean, P), read, R, rate, own, there, UNAMBIGUOUS)

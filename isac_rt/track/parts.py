@@ -96,7 +96,7 @@ class Own:
 class TrackRule(Stateful):
     """A rule that keeps false tracks out; by itself it allows all."""
 
-    def births(self, detections: Detections, own: Own) -> Detections:
+    def candidates(self, detections: Detections, own: Own) -> Detections:
         """Return the detections, of which fewer may start a track."""
         return detections
 
@@ -109,7 +109,7 @@ def follow(tracker: Tracker, rules: Sequence[TrackRule], detections: Detections,
     tentative = frozenset(t.id for t in tracker.tracks if not t.confirmed)
     own = replace(own, tentative=tentative)
     for rule in rules:
-        detections = rule.births(detections, own)
+        detections = rule.candidates(detections, own)
     tracker.update(detections, own.pose, None if own.reference is None else own.reference.state)
     for rule in rules:
         rule.prune(tracker, own)

@@ -23,8 +23,8 @@ from isac_rt.receive.types import Detections, Prediction, Reception
 from isac_rt.track.filter import (
     Ambiguity,
     Gaussian,
-    birth,
     expected,
+    initiate,
     measurement_covariance,
     predict,
     update,
@@ -195,7 +195,7 @@ class Reference(Stateful):
 
     def _restart(self, d: Detections, q: int, std: np.ndarray, own: Pose, tracker: Tracker) -> None:
         """Start the track from detection `q`; the other tracks rested on the old one."""
-        state = birth(d.measured[q], std, own, acceleration_std=self._acceleration_std)
+        state = initiate(d.measured[q], std, own, acceleration_std=self._acceleration_std)
         if state is not None:
             number, snr = tracker.new_id(), float(d.snr[q])
             self.state.track = Track(number, state, snr, confirmed=True, detection=q)

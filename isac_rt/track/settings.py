@@ -16,7 +16,8 @@ class Tracking(Node):
 
     KEEPS_NULL: ClassVar[bool] = True
     REMOVED: ClassVar[dict[str, str]] = {
-        "mirrors": "leave it out: tracks behind a wall are not confirmed with births: unexplained"
+        "births": "initiation",
+        "mirrors": "leave it out: initiation: unexplained confirms no track behind a wall",
     }
 
     acceleration_std_mps2: Positive = 3.0
@@ -40,7 +41,7 @@ class Tracking(Node):
     """Time without a detection after which a confirmed track ends, whatever `drop_misses` says [s];
     one that was seen for less long ends after as many frames as it was seen in. null, the default:
     only `drop_misses` counts."""
-    births: Literal["all", "unexplained"] = "all"
+    initiation: Literal["all", "unexplained"] = "all"
     """Detections that start tracks. `all`, the default. `unexplained`: not those that the city
     explains, as images of terminals or UAVs, surfaces, or static clutter that the mesh lacks;
     confirmation and deletion use the same tests (docs/receiver.md)."""
@@ -48,7 +49,7 @@ class Tracking(Node):
     @property
     def needs_mesh(self) -> bool:
         """True if track initiations are tested against a city's mesh."""
-        return self.births == "unexplained"
+        return self.initiation == "unexplained"
 
     def problems(self) -> Iterator[Problem]:
         if self.confirm_hits > self.confirm_window:

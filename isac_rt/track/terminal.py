@@ -84,8 +84,8 @@ class ActiveTerminal(Stateful):
 
     Parameters
     ----------
-    waveform, antennas, receivers, tracking : with `tracking.births` unexplained the rules are those
-        of `isac_rt.extensions.city_receivers.standard`, which needs a city
+    waveform, antennas, receivers, tracking : with `tracking.initiation` unexplained the rules are
+        those of `isac_rt.extensions.city_receivers.standard`, which needs a city
     equipment : rules for its tracks, and what else it has
 
     Examples
@@ -114,8 +114,10 @@ class ActiveTerminal(Stateful):
         equipment: Equipment | None = None,
     ) -> None:
         self.equipment = equipment or Equipment()
-        if tracking.births == "unexplained" and not self.equipment.rules:
-            raise ValueError("tracking.births unexplained needs rules, as those of a city's walls")
+        if tracking.initiation == "unexplained" and not self.equipment.rules:
+            raise ValueError(
+                "tracking.initiation unexplained needs rules, as those of a city's walls"
+            )
         self._receiver = ActiveReceiver.of(antennas, receivers)
         self.other: Receiver | None = None
         self.tracker = Tracker(tracking, Ambiguity.of(waveform, 2))

@@ -18,9 +18,9 @@ from isac_rt.receive.types import Detections, Prediction
 from isac_rt.track.filter import (
     Ambiguity,
     Gaussian,
-    births,
     costs,
     expected,
+    initiate_all,
     measurement_covariance,
     predict,
     reported,
@@ -30,9 +30,9 @@ from isac_rt.track.settings import Tracking
 from isac_rt.world.swarm import Pose
 
 SURE_HITS = 2
-"""With `tracking.births: unexplained` a track is confirmed if so many of its detections could have
-started it: others pass a lower threshold, which strong clutter passes again and again. At an active
-terminal these are enough, for chance shows none of them twice."""
+"""With `tracking.initiation: unexplained` a track is confirmed if so many of its detections could
+have started it: others pass a lower threshold, which strong clutter passes again and again. At an
+active terminal these are enough, for chance shows none of them twice."""
 ROUNDING = 1e-9
 """Of sums of frame intervals [s]."""
 
@@ -194,8 +194,8 @@ class Followed:
 
 
 class Tracker(Stateful):
-    """All tracks of one terminal but a PT's reference: prediction, association, birth, confirmation
-    and death.
+    """All tracks of one terminal but a PT's reference: prediction, association, initiation,
+    confirmation and death.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ class Tracker(Stateful):
         return self.state.tracks
 
     def new_id(self) -> int:
-        """Numbers in order of birth."""
+        """Numbers in order of initiation."""
         self.state.next_id += 1
         return self.state.next_id - 1
 
@@ -265,7 +265,7 @@ class Tracker(Stateful):
         self._condition(hit, z, detections.std, own, transmitter)
         self.state.tracks = [t for t in self.tracks if not self._dead(t)]
         free = [q for q in free if detections.starts[q]]
-        which, states = births(
+        which, states = initiate_all(
             z[free],
             detections.std[free],
             own,
@@ -354,7 +354,7 @@ class Tracker(Stateful):
         track.missed = 0 if hit else track.missed + 1
         track.recent = [*track.recent, hit][-s.confirm_window :]
         enough = sum(track.recent) >= s.confirm_hits
-        if s.births == "unexplained":
+        if s.initiation == "unexplained":
             sure = track.sure >= min(SURE_HITS, s.confirm_hits)
             enough = sure and (enough or active)
         track.confirmed = track.confirmed or enough

@@ -39,9 +39,9 @@ CROSS: dict[str, tuple[set[str], dict[str, Any], str]] = {
         {"receivers.clutter_detector": "angle_doppler"},
         "predicts clutter from a city's mesh",
     ),
-    "births": (
+    "initiation": (
         {"tracking", "compare", "city"},
-        {"tracking.births": "unexplained"},
+        {"tracking.initiation": "unexplained"},
         "unexplained needs a city",
     ),
     "clutter": ({"clutter", "propagation", "city"}, {"clutter.model": "field"}, "field needs"),

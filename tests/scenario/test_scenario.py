@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from isac_rt.document import MAX_MESSAGES, ScenarioError, ScenarioWarning, _models_in
+from isac_rt.document import MAX_MESSAGES, Document, ScenarioError, ScenarioWarning, _models_in
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.scenario.file import load, to_yaml
 from isac_rt.scenario.swarm import Uav
@@ -632,7 +632,7 @@ def test_the_city_preset_is_the_default_where_paths_are_traced_in_a_city(tmp_pat
         found = read(traced + array)
         assert found.receivers.passive_detector == "beams"
         assert found.receivers.false_alarm_rates == (1e-4, 1e-6)
-        assert found.tracking.births == "unexplained"
+        assert found.tracking.initiation == "unexplained"
     others = (
         BASE,
         BASE + "city: {source: canyon}\n",
@@ -641,7 +641,7 @@ def test_the_city_preset_is_the_default_where_paths_are_traced_in_a_city(tmp_pat
     for text in others:
         kept = read(text)
         assert kept.receivers.clutter_detector == "cfar", text
-        assert kept.tracking.births == "all", text
+        assert kept.tracking.initiation == "all", text
     stated = read(traced + "receivers: {clutter_detector: cfar}\n").receivers
     assert stated.update_false_alarm_rate is None
     assert stated.passive_detector == "beams"
@@ -703,4 +703,13 @@ def test_removed_keys_and_values_say_what_to_write_instead(place, complaint):
     scenario = yaml.safe_load(BASE)
     scenario["swarm"]["AT"] |= tree.pop("swarm", {}).get("AT", {})
     said = complaint(yaml.safe_dump(scenario | tree))
-    assert f"removed in this version; {nodes_with_removals()[place][1]}" in said
+    model, instead = nodes_with_removals()[place]
+    renamed = instead in model.model_fields
+    assert f"{'renamed; write' if renamed else 'removed in this version;'} {instead}" in said
+
+
+def test_a_renamed_key_of_an_earlier_run_keeps_its_value():
+    """Planted bug: `drop_removed` deletes the key."""
+    document = Document.of_tree({"tracking": {"births": "unexplained"}})
+    document.drop_removed(Scenario)
+    assert document.data == {"tracking": {"initiation": "unexplained"}}

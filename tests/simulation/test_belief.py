@@ -64,7 +64,7 @@ def test_only_terminals_are_wrong():
 
 
 def test_a_mesh_without_a_building(tmp_path):
-    """Of a ground and two houses the terminals' mesh lacks one: the walls that they hold births
+    """Of a ground and two houses the terminals' mesh lacks one: the walls that they hold initiation
     against, not the city. Planted bug: the city's own mesh cut."""
     houses = [(0, 0), (40, 0)]
     lines = ["v -99 -99 0", "v 99 -99 0", "v 0 99 0"]

@@ -262,7 +262,7 @@ def marked(z, std):
 
 
 BODY = np.array([14.7, 28.9, 27.1, 0.0, 0.0, 0.0])
-"""At rest as a birth takes it to be, so that the same track is hit whenever it is seen."""
+"""At rest as a new track takes it to be, so that the same track is hit whenever it is seen."""
 STD = np.array([0.031, 0.083, 0.0047, 0.0061])
 
 
@@ -276,7 +276,7 @@ def one_detection(frames=1, reference=False):
 
 @pytest.mark.parametrize(("hits", "window", "misses"), [(2, 3, 2), (3, 4, 3), (1, 1, 2)])
 def test_the_life_of_a_track_over_all_patterns(hits, window, misses):
-    """All patterns of hits and misses over 7 frames after a birth: whether the first track lives
+    """All patterns of hits and misses over 7 frames after initiation: whether the first track lives
     and is confirmed, by the rule word for word. Planted bugs: one miss too many; the window one
     frame too long; a track that needs one hit not confirmed at once; age counted in hits."""
     settings = Tracking(confirm_hits=hits, confirm_window=window, drop_misses=misses)
@@ -310,9 +310,9 @@ def test_the_life_of_a_track_over_all_patterns(hits, window, misses):
 
 
 def test_numbers_snr_and_references():
-    """A track's SNR is that of its own last detection, a birth's of its first, a reference starts
-    none, and a number is used once. Planted bugs: the SNR of another detection or of the first one
-    for ever; references tracked as reflectors."""
+    """A track's SNR is that of its own last detection, a new track's of its first, a reference
+    starts none, and a number is used once. Planted bugs: the SNR of another detection or of the
+    first one for ever; references tracked as reflectors."""
     seen, still = one_detection()
     tracker = Tracker(Tracking(), Ambiguity())
     z = np.column_stack([seen.range, seen.velocity, seen.direction])

@@ -1,5 +1,5 @@
 """The filter against its equations: Singer's model integrated, updates against the maximum of the
-posterior, predicted measurements against samples, births by hand."""
+posterior, predicted measurements against samples, initiation by hand."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.track.filter import (
     Ambiguity,
     Gaussian,
-    birth,
     expected,
+    initiate,
     measure,
     measurement_covariance,
     predict,
@@ -174,16 +174,16 @@ def test_a_detections_covariance_holds_its_senders():
 @pytest.mark.parametrize(
     ("distance", "there"), [(9_000.0, True), (12_500.0, True), (13_200.0, False)]
 )
-def test_a_birth_is_refused_where_its_place_is_too_unsure(distance, there):
+def test_initiation_is_refused_where_its_place_is_too_unsure(distance, there):
     """Straight ahead a place is unsure by the distance times both cosines' deviations: 69, 96 and
     102 m, and 100 m is the limit. Planted bugs: the limit's square forgotten; no limit."""
     ahead = np.array([distance, 0.0, 0.0, 0.0])
     unsure = np.sqrt(STD[0] ** 2 + distance**2 * (STD[2] ** 2 + STD[3] ** 2))
     assert bool(unsure < 100) is there
-    assert (birth(ahead, STD, STILL, acceleration_std=1.0) is not None) is there
+    assert (initiate(ahead, STD, STILL, acceleration_std=1.0) is not None) is there
 
 
-def test_the_velocity_of_a_birth_is_what_its_rate_says():
+def test_the_velocity_of_a_new_track_is_what_its_rate_says():
     """At rest but for what is measured: 10 m/s per axis a priori make the velocity along the line
     of sight (a reflector's: along the bisector, twice the half angle's cosine) known to its rate's
     deviation and leave the others; the acceleration is open. Planted bugs: deviations for
@@ -192,7 +192,7 @@ def test_the_velocity_of_a_birth_is_what_its_rate_says():
     e = STILL.rotation @ [0.21, np.sqrt(1 - 0.21**2 - 0.13**2), -0.13]
     for sender in (None, Gaussian(SENDER * ([1] * 3 + [0] * 6), np.zeros((9, 9)))):
         far = z + np.array([0 if sender is None else 60, 0, 0, 0])
-        g = birth(far, STD, STILL, sender, acceleration_std=1.7)
+        g = initiate(far, STD, STILL, sender, acceleration_std=1.7)
         towards = e
         if sender is not None:
             back = g.mean[:3] - sender.mean[:3]
@@ -208,12 +208,12 @@ def test_the_velocity_of_a_birth_is_what_its_rate_says():
         assert aside @ velocity @ aside == pytest.approx(100, rel=0.01)
         assert not g.mean[6:].any()
         assert g.covariance[6:, 6:] == pytest.approx(1.7**2 * np.eye(3))
-    moving = birth(z, STD, OWN, acceleration_std=1.7)
+    moving = initiate(z, STD, OWN, acceleration_std=1.7)
     assert e @ (moving.mean[3:6] - OWN.velocity) == pytest.approx(-6.1, abs=0.02)
 
 
 @pytest.mark.parametrize("bistatic", [False, True])
-def test_a_birth_is_the_posterior_of_what_was_measured(bistatic):
+def test_a_new_track_is_the_posterior_of_what_was_measured(bistatic):
     """The place as a root of the exact measurement, its covariance by that root's differences with
     respect to what was measured and to where the transmitter is; then mean and covariance at the
     maximum of the posterior, given the rate. The transmitter's own errors are correlated: those of
@@ -262,7 +262,7 @@ def test_a_birth_is_the_posterior_of_what_was_measured(bistatic):
     H = slopes(rate, best).astype(float)
     exact = np.linalg.inv(np.linalg.inv(P) + H.T @ H / variance)
     deviation = np.sqrt(np.diag(exact))
-    g = birth(z, STD, OWN, sender if bistatic else None, acceleration_std=1.7)
+    g = initiate(z, STD, OWN, sender if bistatic else None, acceleration_std=1.7)
     assert np.abs((g.mean - best) / deviation).max() < 1e-3
     assert np.abs((g.covariance - exact) / np.outer(deviation, deviation)).max() < 1e-3
 
@@ -286,7 +286,7 @@ def test_a_folded_velocity_shifts_the_range(passes, periods):
     assert off == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
-def test_a_birth_reads_a_velocity_nearest_to_standing_still():
+def test_initiation_reads_a_velocity_nearest_to_standing_still():
     """A body that comes nearer, beyond half the period at a passive terminal: read a period too
     fast and 0.2 m too short, it is born where it is and with its rate; without the ambiguity 10
     cm off, and flying away. Planted bugs: nearest to the receiver's own velocity; the range
@@ -295,10 +295,10 @@ def test_a_birth_reads_a_velocity_nearest_to_standing_still():
     given = Ambiguity(abs(z[1]) * 1.9, SHIFT)
     folded = z + np.sign(-z[1]) * np.array([-given.shift, given.period, 0, 0])
     sender = Gaussian(SENDER, 1e-8 * np.eye(9))
-    true = birth(z, STD, OWN, sender, acceleration_std=1.0)
-    found = birth(folded, STD, OWN, sender, acceleration_std=1.0, ambiguity=given)
+    true = initiate(z, STD, OWN, sender, acceleration_std=1.0)
+    found = initiate(folded, STD, OWN, sender, acceleration_std=1.0, ambiguity=given)
     assert found.mean == pytest.approx(true.mean, abs=1e-6)
     assert found.covariance == pytest.approx(true.covariance, abs=1e-6)
-    blind = birth(folded, STD, OWN, sender, acceleration_std=1.0)
+    blind = initiate(folded, STD, OWN, sender, acceleration_std=1.0)
     assert np.linalg.norm((blind.mean - true.mean)[:3]) > 0.1
     assert measure(blind.mean, OWN, SENDER)[1] * z[1] < 0

@@ -12,13 +12,13 @@ from scipy.stats import chi2
 
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import (
-    BIRTH_SPEED_STD,
+    INITIAL_SPEED_STD,
     STD_FLOOR,
     Ambiguity,
     Gaussian,
-    birth,
     bistatic_distance,
     expected,
+    initiate,
     measure,
     measurement_covariance,
     predict,
@@ -103,12 +103,12 @@ def test_slopes_over_the_transmitter_against_complex_step():
 @pytest.mark.parametrize(
     "transmitter", [None, Gaussian(AT, np.diag([1e-4, 2e-4, 1e-4, 0.01, 0.02, 0.01]))]
 )
-def test_birth_reproduces_the_detection_and_its_covariance(transmitter):
-    """The state measures what was measured, its position is the reflector's, and 2,000 noisy births
-    scatter as it says; planted bug: covariance with J instead of its inverse."""
+def test_initiation_reproduces_the_detection_and_its_covariance(transmitter):
+    """The state measures what was measured, its position is the reflector's, and 2,000 noisy
+    initiations scatter as it says; planted bug: covariance with J instead of its inverse."""
     t = None if transmitter is None else transmitter.mean
     z = measure(BODY, OWN, t)
-    g = birth(z, STD, OWN, transmitter, acceleration_std=1.0)
+    g = initiate(z, STD, OWN, transmitter, acceleration_std=1.0)
     assert g.mean[:3] == pytest.approx(
         BODY[:3], abs=1e-4
     )  # of deviations of 0.1 m; the pull named below
@@ -129,15 +129,15 @@ def test_birth_reproduces_the_detection_and_its_covariance(transmitter):
                 transmitter.covariance,
             )
         noisy = z + STD * rng.standard_normal(4)
-        position.append(birth(noisy, STD, OWN, at, acceleration_std=1.0).mean[:3] - BODY[:3])
+        position.append(initiate(noisy, STD, OWN, at, acceleration_std=1.0).mean[:3] - BODY[:3])
     spread = np.cov(np.array(position).T)
     ratio = np.linalg.solve(g.covariance[:3, :3], spread)
     # statistical: 2,000 samples, std of a variance 3.2 %, five of them; nonlinearity below 2 %
     assert np.trace(ratio) / 3 == pytest.approx(1.0, abs=0.16)
 
 
-def test_birth_refuses_what_fixes_no_position():
-    start = partial(birth, std=STD, own=OWN, acceleration_std=1.0)
+def test_initiation_refuses_what_fixes_no_position():
+    start = partial(initiate, std=STD, own=OWN, acceleration_std=1.0)
     assert start(np.array([20.0, 1.0, np.nan, np.nan])) is None
     assert start(np.array([20.0, 1.0, 0.8, 0.7])) is None
     short = np.linalg.norm(AT[:3] - OWN.position) - 0.5
@@ -155,7 +155,7 @@ def test_nothing_is_born_in_the_very_place_of_the_transmitter():
     assert there
     sender = Gaussian(np.concatenate([at, np.zeros(3)]), 1e-4 * np.eye(6))
     for length in there:
-        assert birth(np.array([length, 0, 0, 0]), STD, own, sender, acceleration_std=1.0) is None
+        assert initiate(np.array([length, 0, 0, 0]), STD, own, sender, acceleration_std=1.0) is None
 
 
 def test_filter_against_the_joint_posterior():
@@ -225,7 +225,7 @@ def test_consistency_in_monte_carlo(transmitter, interval):
     nees, nis = [], []
     for _ in range(runs):
         x = np.concatenate(
-            [BODY[:3] + rng.normal(0, 3.0, 3), BIRTH_SPEED_STD * rng.standard_normal(3)]
+            [BODY[:3] + rng.normal(0, 3.0, 3), INITIAL_SPEED_STD * rng.standard_normal(3)]
         )
         own, at = OWN, None if transmitter is None else transmitter.copy()
         full = np.concatenate([x, sigma * rng.standard_normal(3)])
@@ -234,7 +234,7 @@ def test_consistency_in_monte_carlo(transmitter, interval):
             return measure(x, own, at) + STD * rng.standard_normal(4)
 
         exact = None if at is None else Gaussian(at, np.zeros((6, 6)))
-        g = birth(see(x, own, at), STD, own, exact, acceleration_std=sigma)
+        g = initiate(see(x, own, at), STD, own, exact, acceleration_std=sigma)
         for _ in range(steps):
             full = F @ full + root @ rng.standard_normal(9)
             x = full[:6]
@@ -263,7 +263,7 @@ def test_consistency_in_monte_carlo(transmitter, interval):
 def test_missing_direction_reduces_the_measurement():
     """Without direction the update equals one with infinite direction deviations; planted bug: NaN
     taken as zero."""
-    g = predict(birth(measure(BODY, OWN) + STD, STD, OWN, acceleration_std=1.0), 0.02, 1.0)
+    g = predict(initiate(measure(BODY, OWN) + STD, STD, OWN, acceleration_std=1.0), 0.02, 1.0)
     z = measure(BODY, OWN) + 0.7 * STD
     partial = update(g, np.array([z[0], z[1], np.nan, np.nan]), np.diag(STD**2), OWN)
     wide = update(g, z, np.diag([STD[0] ** 2, STD[1] ** 2, 1e12, 1e12]), OWN)
@@ -274,7 +274,7 @@ def test_missing_direction_reduces_the_measurement():
 def test_velocity_is_taken_modulo_its_period():
     """A measured velocity beyond the unambiguous span pulls the track by the folded difference
     only."""
-    g = predict(birth(measure(BODY, OWN), STD, OWN, acceleration_std=1.0), 0.02, 1.0)
+    g = predict(initiate(measure(BODY, OWN), STD, OWN, acceleration_std=1.0), 0.02, 1.0)
     z = measure(BODY, OWN)
     folded = z - np.array([0.0, PERIOD, 0.0, 0.0])
     R = np.diag(STD**2)
@@ -363,7 +363,7 @@ def test_a_swarm_that_turns_keeps_its_tracks(interval):
     assert len(ids) == len(tracker.tracks) == 3
 
 
-def test_birth_confirmation_and_death():
+def test_initiation_confirmation_and_deletion():
     """Confirmed at the third hit, dropped after eight misses, a new id afterwards; a single false
     alarm lives until it can no longer reach 3 of 5. Planted bug: misses not reset by a hit."""
     settings = Tracking()
@@ -481,7 +481,7 @@ def test_a_track_says_which_detection_updated_it():
 def test_one_sure_detection_confirms_no_track(sure, frame):
     """Four detections in a row, some of which could have started the track: an active terminal
     confirms it by two that are sure. Planted bugs: any two; the first not counted."""
-    settings = Tracking(births="unexplained")
+    settings = Tracking(initiation="unexplained")
     tracker, first = Tracker(settings, Ambiguity(np.inf, 0.0)), None
     z = measure(BODY, OWN)
     for n, starts in enumerate(sure):

@@ -10,11 +10,11 @@ from scipy import stats
 
 from isac_rt.results.metrics import binomial_interval, gospa
 from isac_rt.track.filter import (
-    BIRTH_SPEED_STD,
+    INITIAL_SPEED_STD,
     MANOEUVRE_TIME,
     Gaussian,
-    birth,
     bistatic_distance,
+    initiate,
     jacobian,
     measure,
     predict,
@@ -103,10 +103,12 @@ def _tracked(runs: int = 100, steps: int = 15) -> tuple[np.ndarray, np.ndarray]:
     nees, nis = [], []
     for _ in range(runs):
         x = np.concatenate(
-            [BODY[:3] + rng.normal(0, 3.0, 3), BIRTH_SPEED_STD * rng.standard_normal(3)]
+            [BODY[:3] + rng.normal(0, 3.0, 3), INITIAL_SPEED_STD * rng.standard_normal(3)]
         )
         own, a = OWN, sigma * rng.standard_normal(3)
-        g = birth(measure(x, own) + STD * rng.standard_normal(4), STD, own, acceleration_std=sigma)
+        g = initiate(
+            measure(x, own) + STD * rng.standard_normal(4), STD, own, acceleration_std=sigma
+        )
         assert g is not None
         for _ in range(steps):
             for _ in range(pieces):
@@ -200,7 +202,7 @@ def consistency_in_manoeuvres() -> Errors:
             for frame, x in enumerate(states[:, flight]):
                 z = measure(x, own, at) + STD * rng.standard_normal(4)
                 if g is None:
-                    g = birth(z, STD, own, sender, acceleration_std=sigma)
+                    g = initiate(z, STD, own, sender, acceleration_std=sigma)
                     assert g is not None
                 else:
                     g = update(predict(g, interval, sigma), z, R, own, at)

@@ -78,7 +78,7 @@ class Ghosts(TrackRule):
         self._alone = np.zeros(0, bool)
         self.state = Echoed()
 
-    def births(self, detections: Detections, own: Own) -> Detections:
+    def candidates(self, detections: Detections, own: Own) -> Detections:
         self._alone = alone(detections, self._leeway)
         return detections
 

@@ -5,7 +5,7 @@ of two planes, wall and ground above all, whatever the angle. Such an echo stand
 but is a point as a UAV is, and the scatterers of the expected clutter do not hold it. The terminal
 knows its pose and the mesh, so that it knows the range of each and its rate. A passive terminal
 knows its transmitter's, and the images of that one's line of sight. Occlusion by other
-buildings is not asked for: an image that is not there only forbids births in a few cells.
+buildings is not asked for: an image that is not there only forbids initiation in a few cells.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Images(TrackRule):
         self._beam = resolutions(waveform, antennas, 1)[2:]
         self._turns = antennas.turns(waveform.wavelength, passes)
 
-    def births(self, detections: Detections, own: Own) -> Detections:
+    def candidates(self, detections: Detections, own: Own) -> Detections:
         d = detections
         spread = ALIAS_DEVIATIONS * d.std[:, 2:] if self._passes == 1 else 0.0
         inside = np.abs(d.direction) + spread < self._edge

@@ -40,7 +40,7 @@ class Surroundings:
 
     Attributes
     ----------
-    walls : the mesh, against which births are held; None: all are allowed
+    walls : the mesh against which track initiation is tested; None: any detection may start one
     clutter : what the terminal expects of the mesh, from the state (6,) of its transmitter as its
         data say, or as it is tracked, and its own pose, both in world coordinates; None: nothing
     """
@@ -57,7 +57,7 @@ def active_terminal(
     walls: Walls | None = None,
 ) -> ActiveTerminal:
     """Return an active terminal; `walls`, the city's mesh, are needed where tracks start only from
-    what the mesh does not explain (`tracking.births`)."""
+    what the mesh does not explain (`tracking.initiation`)."""
     equipment = _active_equipment(waveform, antennas, receivers, tracking, walls)
     return ActiveTerminal(waveform, antennas, receivers, tracking, equipment)
 
@@ -101,9 +101,9 @@ def _active_equipment(
     walls: Walls | None,
 ) -> Equipment:
     rules: list[TrackRule] = []
-    if tracking.births == "unexplained":
+    if tracking.initiation == "unexplained":
         if walls is None:
-            raise ValueError("tracking.births unexplained needs the walls of a city")
+            raise ValueError("tracking.initiation unexplained needs the walls of a city")
         rules += _rules_of_walls(walls, antennas, waveform, 2)
     return Equipment(rules, _hardware(receivers, waveform, antennas, 2))
 
@@ -119,7 +119,7 @@ def _passive_equipment(
 ) -> Equipment:
     walls, clutter = surroundings.walls, surroundings.clutter
     rules: list[TrackRule] = []
-    if tracking.births == "unexplained" and walls is not None:
+    if tracking.initiation == "unexplained" and walls is not None:
         rules += _rules_of_walls(walls, antennas, waveform, 1)
     other_paths = OtherPaths()
     if receivers.link_acquisition == "blind":
@@ -132,7 +132,7 @@ def _passive_equipment(
 def _rules_of_walls(
     walls: Walls, antennas: Antennas, waveform: Waveform, passes: int
 ) -> list[TrackRule]:
-    """Return the rules of `tracking.births: unexplained`."""
+    """Return the rules of `tracking.initiation: unexplained`."""
     return [
         Images(walls, antennas, waveform, passes),
         Ghosts(walls, Leeway.of(waveform, antennas, passes)),

@@ -18,7 +18,7 @@ from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
-from isac_rt.track.filter import BIRTH_SPEED_STD, Ambiguity, mahalanobis
+from isac_rt.track.filter import INITIAL_SPEED_STD, Ambiguity, mahalanobis
 from isac_rt.track.parts import Own, TrackRule
 from isac_rt.track.tracker import Track, Tracker, assign
 from isac_rt.world.swarm import Pose
@@ -81,7 +81,7 @@ class StaticClutter(TrackRule):
         period = Ambiguity.of(waveform, passes).period
         return cls(antennas.turns(waveform.wavelength, passes), walls, period)
 
-    def births(self, detections: Detections, own: Own) -> Detections:
+    def candidates(self, detections: Detections, own: Own) -> Detections:
         self._crowd = np.zeros(len(detections), bool)
         if own.clutter_known:  # else the city's own echoes are among them
             sender = None if own.transmitter is None else own.transmitter.mean[:6]
@@ -128,7 +128,7 @@ class StaticClutter(TrackRule):
         across = speed * np.linalg.norm(d.std[:, 2:], axis=1)
         allowed = STILL_MPS + 3 * np.hypot(d.std[:, 1], across)
         # between both ends of a passive link a UAV that flies along it has the rate of a still one
-        tells = BIRTH_SPEED_STD * seen[each, best] > 3 * allowed
+        tells = INITIAL_SPEED_STD * seen[each, best] > 3 * allowed
         still = tells & (off[each, best] < allowed)
         place = place[each, best]
         self._note(place[some := still & d.starts & ~d.is_reference], d.snr[some], time)
@@ -184,7 +184,7 @@ def rests(track: Track) -> bool:
     velocity, P = track.state.mean[3:6], track.state.covariance[3:6, 3:6]
     d2, log_det = mahalanobis(
         np.tile(velocity, (2, 1)),
-        P + np.square([STILL_MPS, BIRTH_SPEED_STD])[:, None, None] * np.eye(3),
+        P + np.square([STILL_MPS, INITIAL_SPEED_STD])[:, None, None] * np.eye(3),
     )
     still, flies = -(d2 + log_det) / 2
     return bool(still - flies > np.log(STANDS_ODDS))

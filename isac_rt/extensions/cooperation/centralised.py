@@ -33,10 +33,10 @@ from isac_rt.track.filter import (
     STD_FLOOR,
     Ambiguity,
     Gaussian,
-    birth,
     conditioned,
     costs,
     expected,
+    initiate,
     jacobian,
     measure,
     singer,
@@ -320,7 +320,7 @@ class CentralisedTracker(Stateful):
         return joint.without(gone) if gone else joint
 
     def _step(self, joint: JointState, scan: Scan, transmitter: np.ndarray | None) -> JointState:
-        """One scan: prediction, association, updates, births, and what is one UAV."""
+        """One scan: prediction, association, update, initiation, merging of tracks of one UAV."""
         joint = self._alive(self._predicted(joint, scan.time))
         joint = self._with_clock(joint, scan)
         clocks = [*joint.clocks]
@@ -438,7 +438,7 @@ class CentralisedTracker(Stateful):
         own, sender = view.corrected(joint.mean)
         known = None if sender is None else Gaussian(sender, np.zeros((SIZE, SIZE)))
         z, scan = view.scan.z[q], view.scan
-        made = birth(
+        made = initiate(
             z,
             scan.std[q],
             own,

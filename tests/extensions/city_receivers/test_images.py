@@ -204,7 +204,7 @@ def test_images_and_aliases_start_no_track():
     2.1 cells off; at the edge of the view. Planted bugs: range alone decides; velocities not
     folded."""
     cell, period = W.range_cell(2), 2 * W.max_velocity(2)
-    found = Images(city(WALL), ANTENNAS, W, 2).births(
+    found = Images(city(WALL), ANTENNAS, W, 2).candidates(
         detections(
             [9.6 + cell, 9.6, 9.6 + 2.1 * cell, 9.6, 30.0],
             [-0.6, -0.6 + period, -0.6, 1.2, 3.0],
@@ -228,7 +228,7 @@ def test_images_of_the_transmitter_start_no_track_where_they_stand():
         [z[2], z[2], z[2], z[2] - 0.5],
     )
     d = replace(d, direction=np.column_stack([d.direction[:, 0], np.full(4, z[3])]))
-    found = Images(city(WALL), ANTENNAS, W, 1).births(d, Own(own, 0.0, reference=known))
+    found = Images(city(WALL), ANTENNAS, W, 1).candidates(d, Own(own, 0.0, reference=known))
     assert found.starts.tolist() == [False, True, True, True]
 
 
@@ -247,7 +247,7 @@ def test_an_image_beyond_the_view_starts_no_track_in_its_alias():
     known = Track.of_body(Gaussian(sender, 1e-4 * np.eye(6)))
     d = detections([z[0], z[0]], [z[1], z[1]], [z[2] - 1 / 0.5774, z[2] - 0.5 / 0.5774])
     d = replace(d, direction=np.column_stack([d.direction[:, 0], np.full(2, z[3])]))
-    found = Images(city(WALL), ANTENNAS, W, 1).births(d, Own(own, 0.0, reference=known))
+    found = Images(city(WALL), ANTENNAS, W, 1).candidates(d, Own(own, 0.0, reference=known))
     assert found.starts.tolist() == [False, True]
 
 
@@ -255,7 +255,7 @@ def test_an_image_beyond_the_view_starts_no_track_in_its_alias():
 def test_what_may_not_start_a_track_carries_one_on(seen, gone):
     """Two detections, of which one may start a track; in the next frames none may, and the track is
     carried on. Without further ones it ends when 0.2 s have passed, at the third frame of 0.07 s;
-    if it was seen in two frames alone, after two of them. Planted bugs: births of all; frames
+    if it was seen in two frames alone, after two of them. Planted bugs: tracks start on all; frames
     counted instead of the time; young tracks as old ones."""
     settings = Tracking(confirm_hits=1, confirm_window=1, drop_after_s=0.2, drop_misses=90)
     tracker, rest = Tracker(settings, Ambiguity(60.0)), Pose(*np.zeros((3, 3)), np.eye(3))

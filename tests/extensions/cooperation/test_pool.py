@@ -105,7 +105,7 @@ def tracker(terminals=("A", "B")):
 def test_bodies_and_errors_lie_where_their_covariances_say():
     """Thirty draws of all errors: the squared errors of both bodies' states and of all nineteen
     states of the terminals and of B's clock, in their joint covariance, are chi squared within what
-    30 draws may be off at 1e-4. Planted bugs: the sign of the errors in births; errors of the
+    30 draws may be off at 1e-4. Planted bugs: the sign of the errors at initiation; errors of the
     transmitter left out; the attitude's cross product the other way round."""
     rng, total, freedom = np.random.default_rng(7), 0.0, 0
     for _ in range(30):
