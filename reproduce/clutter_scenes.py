@@ -226,7 +226,7 @@ class Scenes:
 
     def sees(self, place: str, points: np.ndarray) -> np.ndarray:
         """(K,) whether the terminal sees points (K, 3) in the air."""
-        from isac_rt.propagation.legs.rays import Shadows
+        from isac_rt.propagation.segments.rays import Shadows
         from isac_rt.world.city.scene import shared_scenes
 
         s = self.setup

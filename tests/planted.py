@@ -16,32 +16,32 @@ class Bug:
 
 OF_CASES = {
     "delay of the line of sight": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         "span = points - start.position",
         "span = points - 1.0001 * start.position",
     ),
     "delay over the ground": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         "mirror_image(image, n, offsets[:, b])",
         "mirror_image(image, 0.9997 * n, offsets[:, b])",
     ),
     "delay over a slanting wall": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         "mirror_image(image, n, offsets[:, b])",
         "mirror_image(image, n, -offsets[:, b])",
     ),
     "delay over two planes": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         "mirror_image(image, n, offsets[:, b])",
         "mirror_image(image, n, offsets[:, 0])",
     ),
     "delay over three planes": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         "mirror_image(image, n, offsets[:, b])",
         "mirror_image(image, n, offsets[:, min(b, 1)])",
     ),
     "corner of three right angles": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         """n = normals[:, b]
         image""",
         """n = normals[:, 0]
@@ -53,17 +53,17 @@ OF_CASES = {
         "local = index.reshape(-1)[faces], (world - centre).astype(np.float32).astype(float)",
     ),
     "doppler of a moving transmitter": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         "w, a = velocity - start.velocity, acceleration - start.acceleration",
         "w, a = velocity - 0 * start.velocity, acceleration - start.acceleration",
     ),
     "doppler of a moving receiver": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         "w, a = velocity - start.velocity",
         "w, a = -velocity - start.velocity",
     ),
     "doppler of a moving reflector": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         "mirror_image(velocity, n)",
         "mirror_image(velocity, 0.7 * n)",
     ),
@@ -71,21 +71,21 @@ OF_CASES = {
         "propagation/scatter_paths.py", "there.rate + back.rate", "there.rate + 0 * back.rate"
     ),
     "doppler of a scatterer": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         """rate = (e * w).sum(1)
     accel = ((w * w).sum(-1) - rate**2) / length + (e * a).sum(1)
-    return Legs(length, rate, accel, e, -e""",
+    return Segments(length, rate, accel, e, -e""",
         """rate = -(e * w).sum(1)
     accel = ((w * w).sum(-1) - rate**2) / length + (e * a).sum(1)
-    return Legs(length, rate, accel, e, -e""",
+    return Segments(length, rate, accel, e, -e""",
     ),
     "doppler of everything at once": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         "velocity = np.broadcast_to(start.velocity, (count, 3)).copy()",
         "velocity = np.zeros((count, 3))",
     ),
     "acceleration of a folded path": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         "mirror_image(acceleration, n)",
         "mirror_image(acceleration, 0.7 * n)",
     ),
@@ -93,22 +93,22 @@ OF_CASES = {
         "propagation/scatter_paths.py", "there.accel + back.accel", "there.accel - back.accel"
     ),
     "mirror points obey fermat": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         """points[:, b] = target
 """,
         """points[:, depth - 1 - b] = target
 """,
     ),
     "reciprocity of folded paths": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         "departure = first - start.position",
         "departure = first - 1.01 * start.position",
     ),
     "every path of a box": Bug(
-        "propagation/legs/images.py", "some[:, 2 : 2 + count]", "some[:, 1 + count : 1 : -1]"
+        "propagation/segments/images.py", "some[:, 2 : 2 + count]", "some[:, 1 + count : 1 : -1]"
     ),
     "a wall 10 km off reflects once": Bug(
-        "propagation/legs/geometry.py", "return which[first]", "return which"
+        "propagation/segments/geometry.py", "return which[first]", "return which"
     ),
     "velocity along waypoints": Bug(
         "world/swarm.py",
@@ -136,16 +136,16 @@ OF_CASES = {
     ),
     "conducting plate": Bug(
         "propagation/scatter_paths.py",
-        "return cls(leg.length, leg.rate",
-        "return cls(leg.length / 2, leg.rate",
+        "return cls(segment.length, segment.rate",
+        "return cls(segment.length / 2, segment.rate",
     ),
     "conducting corner": Bug(
-        "propagation/legs/images.py",
+        "propagation/segments/images.py",
         "keep = one_of_each_chain(owned, part.faces, good)",
         "keep = np.flatnonzero(good)",
     ),
     "reflection of a slab": Bug(
-        "propagation/legs/reflection.py",
+        "propagation/segments/reflection.py",
         "root = np.sqrt(eta - (1 - cosine**2))",
         "root = np.sqrt(eta.real - (1 - cosine**2))",
     ),
@@ -165,7 +165,7 @@ OF_CASES = {
         """pass""",
     ),
     "reflectivity of scatterers": Bug(
-        "propagation/legs/reflection.py",
+        "propagation/segments/reflection.py",
         "np.exp(-4j * np.pi * material.thickness",
         "np.exp(-2j * np.pi * material.thickness",
     ),
@@ -290,7 +290,7 @@ OF_CASES = {
         "there.rate",
     ),
     "mesh to if two rays in motion": Bug(
-        "propagation/legs/geometry.py",
+        "propagation/segments/geometry.py",
         "mirror_image(velocity, n)",
         "mirror_image(velocity, 0.97 * n)",
     ),
@@ -473,12 +473,12 @@ OF_CASES = {
         "propagation/rcs.py", '{"small": 3.74, "large": 2.50}', '{"small": 3.47, "large": 2.50}'
     ),
     "paths of a canyon against sionna": Bug(
-        "propagation/legs/reflection.py",
-        "return (field * vertical(legs.arrival)).sum(1)",
-        "return np.abs((field * vertical(legs.arrival)).sum(1))",
+        "propagation/segments/reflection.py",
+        "return (field * vertical(segments.arrival)).sum(1)",
+        "return np.abs((field * vertical(segments.arrival)).sum(1))",
     ),
     "paths missed in a city": Bug(
-        "propagation/legs/chains.py", "- RAY_OFFSET_M * side", "+ RAY_OFFSET_M * side"
+        "propagation/segments/chains.py", "- RAY_OFFSET_M * side", "+ RAY_OFFSET_M * side"
     ),
     "echoes against sionna": Bug(
         "propagation/raytrace.py",
@@ -507,7 +507,7 @@ OF_TESTS = (
     (
         "test_hard_geometry::test_grazing_rays",
         Bug(
-            "propagation/legs/geometry.py",
+            "propagation/segments/geometry.py",
             "mirror_image(image, n, offsets[:, b])",
             "mirror_image(image, 0.9997 * n, offsets[:, b])",
         ),
@@ -515,7 +515,7 @@ OF_TESTS = (
     (
         "test_hard_geometry::test_a_transmitter_close_to_a_wall_or_on_it",
         Bug(
-            "propagation/legs/clearance.py",
+            "propagation/segments/clearance.py",
             "offsets[:, None]) < most",
             "offsets[:, None]) < 0",
         ),
@@ -523,7 +523,7 @@ OF_TESTS = (
     (
         "test_hard_geometry::test_a_transmitter_close_to_a_wall_or_on_it",
         Bug(
-            "propagation/legs/clearance.py",
+            "propagation/segments/clearance.py",
             "float(distance_to_triangles(city.corners[near], positions[name]).min())",
             "float(np.abs(city.normals @ positions[name] - city.plane_offsets).min())",
         ),
@@ -539,7 +539,7 @@ OF_TESTS = (
     (
         "test_hard_geometry::test_a_vertical_link_with_vertical_polarisation",
         Bug(
-            "propagation/legs/direct.py",
+            "propagation/segments/direct.py",
             "friis = wavelength / (4 * np.pi * direct.length)",
             "friis = wavelength / (4 * np.pi * direct.length) * (-1 if abs(direct.departure[0, 2]) > 0.999999999 else 1)",
         ),
@@ -547,7 +547,7 @@ OF_TESTS = (
     (
         "test_hard_geometry::test_a_target_inside_the_radars_own_body",
         Bug(
-            "propagation/legs/direct.py",
+            "propagation/segments/direct.py",
             """> 1e-9
     ]""",
             "> 1e-1]",

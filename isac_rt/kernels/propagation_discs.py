@@ -1,4 +1,4 @@
-"""Kernel of `isac_rt.propagation.legs.discs`."""
+"""Kernel of `isac_rt.propagation.segments.discs`."""
 
 from __future__ import annotations
 

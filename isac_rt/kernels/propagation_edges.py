@@ -1,4 +1,4 @@
-"""Kernels of `isac_rt.propagation.legs.edges`."""
+"""Kernels of `isac_rt.propagation.segments.edges`."""
 
 from __future__ import annotations
 

@@ -18,11 +18,11 @@ def advance(surfaces, points, face, area, share, scale, start, end, own, rows):
         i = index[row]
         f = face[i]
         nx, ny, nz = surfaces.normals[f, 0], surfaces.normals[f, 1], surfaces.normals[f, 2]
-        r1, v1, a1, x1, y1, z1 = leg_to(points[i, 0], points[i, 1], points[i, 2], start)
+        r1, v1, a1, x1, y1, z1 = segment_to(points[i, 0], points[i, 1], points[i, 2], start)
         r2, v2, a2, x2, y2, z2 = r1, v1, a1, x1, y1, z1
         departure[row, 0], departure[row, 1], departure[row, 2] = x1, y1, z1
         if not own:
-            r2, v2, a2, x2, y2, z2 = leg_to(points[i, 0], points[i, 1], points[i, 2], end)
+            r2, v2, a2, x2, y2, z2 = segment_to(points[i, 0], points[i, 1], points[i, 2], end)
             arrival[row, 0], arrival[row, 1], arrival[row, 2] = x2, y2, z2
         tx_radius[row], rx_radius[row] = r1, r2
         length[row], rate[row], accel[row] = r1 + r2, v1 + v2, a1 + a2
@@ -71,7 +71,7 @@ def scattered_power(surfaces, face, area, into, back, between, part):
 
 
 @jit(inline=True)
-def leg_to(px, py, pz, body):
+def segment_to(px, py, pz, body):
     """Distance from a moving body to a point, its rate and acceleration, and the unit vector
     towards the point."""
     x, y, z = px - body[0, 0], py - body[0, 1], pz - body[0, 2]

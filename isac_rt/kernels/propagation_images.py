@@ -1,4 +1,4 @@
-"""Kernels of `isac_rt.propagation.legs.images`."""
+"""Kernels of `isac_rt.propagation.segments.images`."""
 
 from __future__ import annotations
 

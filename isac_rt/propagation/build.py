@@ -25,7 +25,7 @@ class Ground:
     swarm, city, waveform : of the run
     free : closed forms of the lines of sight and echoes in free space
     sample_spacing : flight between the places from which rays search for walls [m]; 0: they search
-        from where a terminal is (`legs.chains`)
+        from where a terminal is (`segments.chains`)
     floor : noise that covers scatterers of the clutter field, which then are merged; None: all stay
     """
 

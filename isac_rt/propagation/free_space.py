@@ -11,11 +11,11 @@ import numpy as np
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
-from isac_rt.propagation.legs.geometry import Legs, straight
 from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, merge
 from isac_rt.propagation.rcs import CrossSection
 from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
+from isac_rt.propagation.segments.geometry import Segments, straight
 from isac_rt.world.settings import Uav
 from isac_rt.world.swarm import Pose
 
@@ -86,7 +86,7 @@ class FreeSpace:
     def _echoes(self, state: LinkState, poses: dict[str, Pose]) -> PathSet:
         """Echoes of every UAV that is neither end, straight there and straight on."""
         others = [name for name in self.names if name not in state.link]
-        there, back = (self._legs(end, others, poses) for end in (state.start, state.end))
+        there, back = (self._segments(end, others, poses) for end in (state.start, state.end))
         scatter_paths = ScatterPaths.over(there, back)
         amplitude = np.empty(len(others))
         for k, name in enumerate(others):
@@ -107,12 +107,12 @@ class FreeSpace:
             faces=np.full((len(others), 1), -1),
         )
 
-    def _legs(self, end: Pose, names: Sequence[str], poses: dict[str, Pose]) -> Legs:
-        """Straight legs from an end to UAVs."""
+    def _segments(self, end: Pose, names: Sequence[str], poses: dict[str, Pose]) -> Segments:
+        """Straight segments from an end to UAVs."""
         motion = np.array([poses[name].motion() for name in names]).reshape(-1, 3, 3)
         return straight(end, *motion.swapaxes(0, 1))
 
-    def _echo(self, name: str, poses: dict[str, Pose], there: Legs, back: Legs) -> float:
+    def _echo(self, name: str, poses: dict[str, Pose], there: Segments, back: Segments) -> float:
         """Amplitude of one UAV's echo by the radar equation, without the elements."""
         uav = poses[name]
         section = self.sections[name].square_metres(
@@ -154,6 +154,6 @@ class FreeSpace:
         out = {}
         for name, uav in self.uavs.items():
             if name != tx and uav.rcs.model != "relative":
-                leg = self._legs(poses[tx], [name], poses)
-                out[name] = self._echo(name, poses, leg, leg)
+                segment = self._segments(poses[tx], [name], poses)
+                out[name] = self._echo(name, poses, segment, segment)
         return out

@@ -132,8 +132,7 @@ class PathSet:
 
     @property
     def bent(self) -> np.ndarray:
-        """(K,) whether a path bends round a shadow edge: it has a point that is neither a bounce
-        nor a UAV."""
+        """(K,) bool: the path bends round an edge, a point neither a bounce nor a UAV."""
         return np.isfinite(self.points).all(axis=2).sum(axis=1) > self.bounces + (self.target >= 0)
 
     def select(self, which: np.ndarray) -> PathSet:

@@ -1,24 +1,24 @@
 """Ray-traced paths: rays in Sionna RT's scene find the chains of walls, float64 images say which of
 them are paths, and where.
 
-Legs run from the terminals to every UAV: terminal to terminal, terminal back to itself, and
+Segments run from the terminals to every UAV: terminal to terminal, terminal back to itself, and
 terminal to target. Rays that leave the terminals from time samples of their flights find which
-walls a wave may meet one after the other (`legs.chains`); images place the pooled chains in each
-frame (`legs.images`), with length, rate, acceleration, directions and points from the planes of the
-mesh, and slab coefficients of the faces that hold the points. Straight legs then bend round shadow
-edges, and the swarm's UAVs shadow legs of all kinds (`direct`, `discs`).
+walls a wave may meet one after the other (`segments.chains`); images place the pooled chains in
+each frame (`segments.images`), with length, rate, acceleration, directions and points from the
+planes of the mesh, and slab coefficients of the faces that hold the points. Straight segments then
+bend round shadow edges, and the swarm's UAVs shadow segments of all kinds (`direct`, `discs`).
 
-`RayTracer.by_sionna` gives the same tracer with the legs of Sionna's own solver, which shares with
-the above neither the search nor the images, the visibility nor the amplitudes (its delays are
+`RayTracer.by_sionna` gives the same tracer with the segments of Sionna's own solver, which shares
+with the above neither the search nor the images, the visibility nor the amplitudes (its delays are
 unfolded in float64 too: in float32 they are off by up to a radian and more at this carrier). It is
 the cross-check of the paths that a run misses.
 
-Echoes and ghosts of UAVs are products of legs with the amplitude sqrt(4 pi sigma)/lambda, a point
-scatterer. Sionna's own RCS solver gives the same paths, but wants the UAVs in the scene, where
-each shadows the terminal that carries it, and one solve per link; a test holds the two against each
-other. What is left out: a wave that one leg turns from vertical to horizontal polarisation and the
-other turns back (nothing for echoes and for ghosts of one bounce, up to 6 % of single ghosts of two
-bounces in a street canyon).
+Echoes and ghosts of UAVs are products of segments with the amplitude sqrt(4 pi sigma)/lambda, a
+point scatterer. Sionna's own RCS solver gives the same paths, but wants the UAVs in the scene,
+where each shadows the terminal that carries it, and one solve per link; a test holds the two
+against each other. What is left out: a wave that one segment turns from vertical to horizontal
+polarisation and the other turns back (nothing for echoes and for ghosts of one bounce, up to 6 % of
+single ghosts of two bounces in a street canyon).
 
 Points are world coordinates outside this module and local (recentred) coordinates inside. Import
 only after `isac_rt.runtime.activate()`.
@@ -41,23 +41,23 @@ from isac_rt.propagation.clutter.field import ClutterField
 from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.clutter.visibility import Flight
 from isac_rt.propagation.free_space import FreeSpace
-from isac_rt.propagation.legs.chains import Search
-from isac_rt.propagation.legs.clearance import Clearance
-from isac_rt.propagation.legs.direct import past_edges_and_discs
-from isac_rt.propagation.legs.discs import UavDiscs
-from isac_rt.propagation.legs.edges import ShadowEdges
-from isac_rt.propagation.legs.geometry import (
+from isac_rt.propagation.model import Census, Traced
+from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
+from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
+from isac_rt.propagation.segments.chains import Search
+from isac_rt.propagation.segments.clearance import Clearance
+from isac_rt.propagation.segments.direct import past_edges_and_discs
+from isac_rt.propagation.segments.discs import UavDiscs
+from isac_rt.propagation.segments.edges import ShadowEdges
+from isac_rt.propagation.segments.geometry import (
     edges_in_any_order,
     one_of_each_chain,
     plane_of_each_face,
     unfold,
 )
-from isac_rt.propagation.legs.images import PROBES_M, SLACK, STRETCH, Images
-from isac_rt.propagation.legs.legset import LegSet, TracedLegs, leg_set
-from isac_rt.propagation.legs.rays import Shadows
-from isac_rt.propagation.model import Census, Traced
-from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
-from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
+from isac_rt.propagation.segments.images import PROBES_M, SLACK, STRETCH, Images
+from isac_rt.propagation.segments.rays import Shadows
+from isac_rt.propagation.segments.segment_set import SegmentSet, TracedSegments, segment_set
 from isac_rt.propagation.settings import Clutter, Propagation
 from isac_rt.registry import extension
 from isac_rt.world.city.mesh import CityMesh
@@ -150,8 +150,8 @@ class RayTracer:
         return out
 
     def by_sionna(self, num_rays: int) -> RayTracer:
-        """The same tracer with the legs of Sionna's own solver, solved anew at each instant with so
-        many rays, without scatterers."""
+        """The same tracer with the segments of Sionna's own solver, solved anew at each instant
+        with so many rays, without scatterers."""
         out = copy.copy(self)
         out.field = out.two_bounces = None
         out._solved_with = num_rays
@@ -176,15 +176,16 @@ class RayTracer:
             chains = {
                 name: self._search.chains(name, local[name], epoch) for name in self._terminals
             }
-            legs = self._images.legs(chains, {name: local[name] for name in self._free.names})
+            ends = {name: local[name] for name in self._free.names}
+            segments = self._images.segments(chains, ends)
         else:
-            legs, dropped, _ = self._solved_legs(local, self._solved_with)
+            segments, dropped, _ = self._solved_segments(local, self._solved_with)
         discs = UavDiscs.of(self._swarm.uavs, local)
-        legs = past_edges_and_discs(legs, local, self._edges, discs, self._free.wavelength)
+        segments = past_edges_and_discs(segments, local, self._edges, discs, self._free.wavelength)
         paths = {}
         for link in links:
             state = LinkState(link, epoch, local[link.tx], local[link.rx], self._free.names)
-            paths[link] = self._link(state, local, legs, discs)
+            paths[link] = self._link(state, local, segments, discs)
         return Traced(paths, dropped)
 
     def _local(self, poses: dict[str, Pose]) -> dict[str, Pose]:
@@ -237,8 +238,8 @@ class RayTracer:
             )
         return found
 
-    def _solved_legs(self, local: dict[str, Pose], num_rays: int) -> TracedLegs:
-        """Legs from every terminal to every UAV, by mirror reflections only, of Sionna's solver."""
+    def _solved_segments(self, local: dict[str, Pose], num_rays: int) -> TracedSegments:
+        """Mirrored segments of Sionna's solver from every terminal to every UAV."""
         p = self._propagation
         depth = p.max_bounces if self._city.num_faces else 0
         sources = {name: local[name].position for name in self._terminals}
@@ -271,11 +272,11 @@ class RayTracer:
                     rows, which = np.append(rows, first + steps), np.append(which, found_beside)
                     loose = np.append(loose, np.full(steps.size, SLACK))
                 at = rows, j, which
-                out[Link(start, end)], astray, again = self._leg_set(
+                out[Link(start, end)], astray, again = self._segment_set(
                     local[start], local[end], amplitude[at], faces[at], points[at], loose
                 )
                 dropped, duplicates = dropped + astray, duplicates + again
-        return TracedLegs(out, dropped, duplicates)
+        return TracedSegments(out, dropped, duplicates)
 
     def _read(
         self, found: rt.Paths, depth: int
@@ -297,7 +298,7 @@ class RayTracer:
         points = np.moveaxis(np.asarray(found.vertices, np.float64), 0, -2)
         return amplitude, valid, faces, points
 
-    def _leg_set(
+    def _segment_set(
         self,
         start: Pose,
         end: Pose,
@@ -305,7 +306,7 @@ class RayTracer:
         faces: np.ndarray,
         points: np.ndarray,
         slack: np.ndarray,
-    ) -> tuple[LegSet, int, int]:
+    ) -> tuple[SegmentSet, int, int]:
         """Unfold chains depth by depth, drop what contradicts Sionna's points by more than `slack`,
         drop duplicates, sort. Also how many of either were dropped."""
         parts, dropped, duplicates = [], 0, 0
@@ -315,32 +316,32 @@ class RayTracer:
             if count == 0 and np.linalg.norm(end.position - start.position) < 1e-9:
                 # a terminal's path to itself is its leakage, which is not the ray tracer's
                 continue
-            legs = unfold(self._normals[chain], self._offsets[chain], start, end)
-            distance = np.linalg.norm(legs.points - points[which][:, :count], axis=-1).max(
+            segments = unfold(self._normals[chain], self._offsets[chain], start, end)
+            distance = np.linalg.norm(segments.points - points[which][:, :count], axis=-1).max(
                 axis=1, initial=0.0
             )
-            good = distance < STRETCH * legs.length + slack[which]
+            good = distance < STRETCH * segments.length + slack[which]
             # what stands beside may well go astray at grazing angles
             dropped += int((~good & (slack[which] == 0)).sum())
-            planes = edges_in_any_order(self._city.plane_of_face[chain], legs.points)
+            planes = edges_in_any_order(self._city.plane_of_face[chain], segments.points)
             keep = one_of_each_chain(planes, chain, good)
             duplicates += int(good.sum()) - keep.size
-            keep = keep[np.argsort(legs.length[keep], kind="stable")]
-            parts.append((amplitude[which][keep], legs.select(keep), chain[keep], planes[keep]))
-        return leg_set(parts, faces.shape[1]), dropped, duplicates
+            keep = keep[np.argsort(segments.length[keep], kind="stable")]
+            parts.append((amplitude[which][keep], segments.select(keep), chain[keep], planes[keep]))
+        return segment_set(parts, faces.shape[1]), dropped, duplicates
 
     def _link(
         self,
         state: LinkState,
         local: dict[str, Pose],
-        legs: dict[Link, LegSet],
+        segments: dict[Link, SegmentSet],
         discs: UavDiscs,
     ) -> PathSet:
         link, antennas = state.link, self._free.antennas
-        parts = [self._by_the_city(state, legs[link])]
+        parts = [self._by_the_city(state, segments[link])]
         others = [name for name in self._free.names if name not in link]
         if others:
-            parts.append(self._by_way_of(state, {name: local[name] for name in others}, legs))
+            parts.append(self._by_way_of(state, {name: local[name] for name in others}, segments))
         if self.field is not None:
             parts.append(self.field.paths(state, antennas, discs))
         if self.two_bounces is not None:
@@ -364,37 +365,38 @@ class RayTracer:
             target_names=state.target_names,
         )
 
-    def _by_the_city(self, state: LinkState, found: LegSet) -> PathSet:
+    def _by_the_city(self, state: LinkState, found: SegmentSet) -> PathSet:
         """Line of sight and mirror reflections of the city."""
-        scatter_paths = ScatterPaths.along(found.legs)
+        scatter_paths = ScatterPaths.along(found.segments)
         return state.paths(
             scatter_paths,
             found.amplitude * state.elements(self._free.antennas, scatter_paths),
             np.where(found.bounces > 0, PathKind.SPECULAR, PathKind.LINE_OF_SIGHT),
             bounces=found.bounces,
-            points=found.legs.points,
+            points=found.segments.points,
             faces=found.faces,
         )
 
     def _by_way_of(
-        self, state: LinkState, discs: dict[str, Pose], legs: dict[Link, LegSet]
+        self, state: LinkState, discs: dict[str, Pose], segments: dict[Link, SegmentSet]
     ) -> PathSet:
-        """Echoes and ghosts of UAVs: every leg to one with every leg from it, up to the bounces
-        allowed."""
+        """Echoes and ghosts of UAVs: every segment to one with every segment from it, up to the
+        bounces allowed."""
         most = self._propagation.max_bounces if self._propagation.ghosts else 0
         sent, received, sections, numbers = [], [], [], []
         for name, pose in discs.items():
-            to, on = legs[Link(state.link.tx, name)], legs[Link(state.link.rx, name)]
+            to, on = segments[Link(state.link.tx, name)], segments[Link(state.link.rx, name)]
             i, j = np.divmod(np.arange(len(to) * len(on)), max(len(on), 1))
             allowed = np.flatnonzero(to.bounces[i] + on.bounces[j] <= most)
             to, on = to.select(i[allowed]), on.select(j[allowed])
-            aspects = pose.to_body(to.legs.arrival), pose.to_body(on.legs.arrival)
+            aspects = pose.to_body(to.segments.arrival), pose.to_body(on.segments.arrival)
             sections.append(self._free.sections[name].square_metres(*aspects))
             numbers.append(np.full(len(to), self._free.names.index(name)))
             sent.append(to)
             received.append(on)
-        there, back, target = LegSet.joined(sent), LegSet.joined(received), np.concatenate(numbers)
-        a, b, bounces = there.legs, back.legs, there.bounces + back.bounces
+        there, back = SegmentSet.joined(sent), SegmentSet.joined(received)
+        target = np.concatenate(numbers)
+        a, b, bounces = there.segments, back.segments, there.bounces + back.bounces
         scatter = np.sqrt(4 * np.pi * np.concatenate(sections)) / self._free.wavelength
         scatter_paths = ScatterPaths.over(a, b)
         elements = state.elements(self._free.antennas, scatter_paths)

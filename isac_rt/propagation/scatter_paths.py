@@ -10,8 +10,8 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
-from isac_rt.propagation.legs.geometry import Legs
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
+from isac_rt.propagation.segments.geometry import Segments
 from isac_rt.world.swarm import Pose
 
 
@@ -35,13 +35,13 @@ class ScatterPaths:
     arrival: np.ndarray
 
     @classmethod
-    def along(cls, leg: Legs) -> ScatterPaths:
-        """From end to end in one leg."""
-        ends = leg.length, leg.length, leg.departure, leg.arrival
-        return cls(leg.length, leg.rate, leg.accel, *ends)
+    def along(cls, segment: Segments) -> ScatterPaths:
+        """From end to end in one segment."""
+        ends = segment.length, segment.length, segment.departure, segment.arrival
+        return cls(segment.length, segment.rate, segment.accel, *ends)
 
     @classmethod
-    def over(cls, there: Legs, back: Legs) -> ScatterPaths:
+    def over(cls, there: Segments, back: Segments) -> ScatterPaths:
         """By way of what scatters; `there` starts at the transmitter, `back` at the receiver."""
         motion = there.length + back.length, there.rate + back.rate, there.accel + back.accel
         return cls(*motion, there.length, back.length, there.departure, back.departure)

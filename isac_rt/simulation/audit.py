@@ -24,9 +24,9 @@ from isac_rt.kernels.signal_gridded import GRIDDED_ERROR
 from isac_rt.propagation.clutter.cells import Density, error_for
 from isac_rt.propagation.clutter.merging import difference_db, resolution_cell
 from isac_rt.propagation.clutter.rayleigh import RayleighClutter
-from isac_rt.propagation.legs.geometry import plane_of_each_face, unfold
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.scatter_paths import LinkState
+from isac_rt.propagation.segments.geometry import plane_of_each_face, unfold
 from isac_rt.propagation.store import CachedPropagation
 from isac_rt.randomness import generator
 from isac_rt.receive.known import Known

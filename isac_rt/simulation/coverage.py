@@ -210,7 +210,7 @@ def _flights(swarm: Swarm, epochs: list[float]) -> dict[str, _Flight]:
     return out
 
 
-def _leg(start: _Flight, end: _Flight, antennas: Antennas) -> tuple[np.ndarray, ...]:
+def _segment(start: _Flight, end: _Flight, antennas: Antennas) -> tuple[np.ndarray, ...]:
     """Length (T,), its rate, and whether the end is in the view of the start."""
     offset = end.position - start.position
     length = np.linalg.norm(offset, axis=1)
@@ -223,11 +223,11 @@ def _outside(
     link: Link, name: str, flights: dict[str, _Flight], antennas: Antennas, of: LinkCoverage
 ) -> Outside:
     tx, rx, uav = (flights[n] for n in (link.tx, link.rx, name))
-    length, rate, in_view = _leg(rx, uav, antennas)
+    length, rate, in_view = _segment(rx, uav, antennas)
     if name == link.tx:  # the line of sight
-        in_view &= _leg(tx, rx, antennas)[2]
+        in_view &= _segment(tx, rx, antennas)[2]
     elif not link.own:
-        first, first_rate, lit = _leg(tx, uav, antennas)
+        first, first_rate, lit = _segment(tx, uav, antennas)
         length, rate, in_view = length + first, rate + first_rate, in_view & lit
     half = of.range_resolution_m / 2  # a path is looked for in the row that is nearest
     far, near = length >= of.max_range_m - half, length < of.min_range_m - half

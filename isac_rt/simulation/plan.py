@@ -13,7 +13,7 @@ Omitted paths. Paths that the IF filter stops in all groups, chirps and symbols 
 error. Of ghosts and paths of the city the weakest are omitted as long as their power per range cell
 stays ``propagation.weakest_path_db`` below the noise of a range-Doppler-antenna cell; powers add on
 average, whatever the phases. Interaction sequences that no ray hits are missed
-(`isac_rt.propagation.legs.chains`); the others have no error.
+(`isac_rt.propagation.segments.chains`); the others have no error.
 
 The share of missed paths is estimated by the share that only the even or only the odd time samples
 find. The second half of the rays adds half of that number; all further rays are assumed to add

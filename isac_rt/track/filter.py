@@ -102,23 +102,23 @@ def measure(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None)
     return np.stack([distance, rate, u[..., 0], u[..., 2]], axis=-1)
 
 
-def _leg_jacobian(offset: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _segment_jacobian(offset: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Derivative of (length, rate) of one path segment with respect to relative position and
     velocity (..., 2, 6), and of its direction with respect to the position, (I - e e^T)/r (..., 3,
     3)."""
     r, e = _unit(offset)
     turn = (np.eye(3) - e[..., :, None] * e[..., None, :]) / r[..., None, None]
-    leg = np.zeros((*e.shape[:-1], 2, 6))
-    leg[..., 0, :3] = leg[..., 1, 3:] = e
-    leg[..., 1, :3] = (turn @ velocity[..., None])[..., 0]
-    return leg, turn
+    segment = np.zeros((*e.shape[:-1], 2, 6))
+    segment[..., 0, :3] = segment[..., 1, 3:] = e
+    segment[..., 1, :3] = (turn @ velocity[..., None])[..., 0]
+    return segment, turn
 
 
 def jacobian(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None) -> np.ndarray:
     """Derivative of `measure` with respect to the UAV's states (..., S): (..., 4, S)."""
-    leg, turn = _leg_jacobian(state[..., :3] - own.position, state[..., 3:6] - own.velocity)
+    segment, turn = _segment_jacobian(state[..., :3] - own.position, state[..., 3:6] - own.velocity)
     out = np.zeros((*state.shape[:-1], 4, state.shape[-1]))
-    out[..., :2, :6] = leg
+    out[..., :2, :6] = segment
     out[..., 2:, :3] = own.rotation.T[[0, 2]] @ turn  # u_x, u_z
     if transmitter is not None:
         out[..., :2, :6] -= transmitter_jacobian(state, transmitter)[..., :2, :6]
@@ -130,7 +130,7 @@ def transmitter_jacobian(state: np.ndarray, transmitter: np.ndarray) -> np.ndarr
     transmitter's state (S,): (..., 4, S)."""
     out = np.zeros((*state.shape[:-1], 4, transmitter.size))
     offset, speed = state[..., :3] - transmitter[:3], state[..., 3:6] - transmitter[3:6]
-    out[..., :2, :6] = -_leg_jacobian(offset, speed)[0]
+    out[..., :2, :6] = -_segment_jacobian(offset, speed)[0]
     return out
 
 

@@ -70,7 +70,7 @@ def test_planes_of_faces():
 def test_segments_that_pass_a_disc():
     """Segments near and far, one of length zero, some spared. Planted bug: the distance before the
     segment left out of the Fresnel zone."""
-    import isac_rt.propagation.legs.discs  # noqa: F401  # has the twin
+    import isac_rt.propagation.segments.discs  # noqa: F401  # has the twin
 
     rng = np.random.default_rng(9)
     count, discs = 300, 7
@@ -79,7 +79,7 @@ def test_segments_that_pass_a_disc():
     before = rng.uniform(0, 60, count)
     total = before + np.linalg.norm(ends - starts, axis=1) + rng.uniform(0, 60, count)
     places, radii = rng.uniform(-25, 25, (discs, 3)), rng.uniform(0.1, 4, discs)
-    name = "isac_rt.propagation.legs.discs.near"
+    name = "isac_rt.propagation.segments.discs.near"
     for spared in (rng.random((count, discs)) < 0.2, rng.random((1, discs)) < 0.3):
         paths = starts, ends, before, total
         assert_twins_agree(name, *paths, places, radii, spared, 0.0039, 3.7, rtol=1e-12)
@@ -89,7 +89,7 @@ def test_segments_that_pass_a_disc():
 def test_edges_near_a_path():
     """Edges strewn over 100 m and paths past them, of many with one near. Planted bug: the foot of
     the near end weighed by its own distance from the edge."""
-    from isac_rt.propagation.legs.edges import Edges
+    from isac_rt.propagation.segments.edges import Edges
 
     rng = np.random.default_rng(10)
     count = 700
@@ -101,7 +101,7 @@ def test_edges_near_a_path():
     apart = np.linalg.norm(middle[block] - centre[:, None], axis=2) + half[block]
     radius = np.where(block < 0, 0.0, apart).max(axis=1)
     edges = Edges(start, span, wings, middle, half, block, centre, radius)
-    name, found = "isac_rt.propagation.legs.edges.near", []
+    name, found = "isac_rt.propagation.segments.edges.near", []
     for source, sink in rng.uniform(-40, 40, (20, 2, 3)):
         for reach in (0.07, 1.3, 30.0):
             # a detour is a difference of lengths of 100 m
@@ -115,8 +115,8 @@ def test_edges_near_a_path():
 def test_chains_that_reach_a_place(depth):
     """All chains of up to three of the planes of a city of blocks, to places before and behind its
     walls. Planted bugs: the mirror crossed from either side; the parent's image left out."""
-    from isac_rt.propagation.legs.chains import Chains
-    from isac_rt.propagation.legs.images import Mirrors
+    from isac_rt.propagation.segments.chains import Chains
+    from isac_rt.propagation.segments.images import Mirrors
     from isac_rt.scenario import City
     from isac_rt.world.city import load_city
 
@@ -133,7 +133,7 @@ def test_chains_that_reach_a_place(depth):
         first.append(first[-1] + parent[-1].size)
     chains = Chains(np.concatenate(parent), np.concatenate(plane), np.array(first))
     ends = np.random.default_rng(11).uniform([-20, -20, 2], [20, 20, 25], (12, 3))
-    name = "isac_rt.propagation.legs.images.reflected"
+    name = "isac_rt.propagation.segments.images.reflected"
     arguments = chains, Mirrors.of(city), depth, np.array([1.3, -2.1, 9.7]), ends
     assert_twins_agree(name, *arguments, rtol=0)
     lengths = (TWINS[name][1](*arguments)[:, 1:] >= 0).sum(axis=1)

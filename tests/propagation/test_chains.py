@@ -71,11 +71,11 @@ def mesh(quads, materials=None, of=None) -> CityMesh:
 def test_sets_of_chains_are_padded_with_minus_one():
     """What `PathSet` promises of faces where there is none, and NaN for their points. Planted bug:
     padded with another number."""
-    from isac_rt.propagation.legs.geometry import Legs
-    from isac_rt.propagation.legs.legset import leg_set
+    from isac_rt.propagation.segments.geometry import Segments
+    from isac_rt.propagation.segments.segment_set import segment_set
 
     def some(count: int, depth: int) -> tuple:
-        legs = Legs(
+        segments = Segments(
             np.ones(count),
             np.ones(count),
             np.ones(count),
@@ -84,13 +84,15 @@ def test_sets_of_chains_are_padded_with_minus_one():
             np.ones((count, depth, 3)),
         )
         chain = 7 + np.arange(count * depth).reshape(count, depth)
-        return np.ones(count, complex), legs, chain, 2 * chain
+        return np.ones(count, complex), segments, chain, 2 * chain
 
-    joined = leg_set([some(2, 1), some(1, 3)], 3)
+    joined = segment_set([some(2, 1), some(1, 3)], 3)
     assert joined.faces.tolist() == [[7, -1, -1], [8, -1, -1], [7, 8, 9]]
     assert joined.planes.tolist() == [[14, -1, -1], [16, -1, -1], [14, 16, 18]]
     assert joined.bounces.tolist() == [1, 1, 3]
-    assert np.isnan(joined.legs.points[:2, 1:]).all() and (joined.legs.points[:, 0] == 1).all()
+    assert (
+        np.isnan(joined.segments.points[:2, 1:]).all() and (joined.segments.points[:, 0] == 1).all()
+    )
 
 
 def keyed(paths: PathSet) -> dict[tuple, int]:
@@ -161,7 +163,7 @@ def test_a_frame_is_a_function_of_itself(streets):
 def test_halves_of_the_knots_know_nothing_of_each_other(streets):
     """Even and odd time samples share neither a place nor a direction, and their chains together
     are the pool. Planted bug: both halves are the even time samples."""
-    from isac_rt.propagation.legs.chains import directions
+    from isac_rt.propagation.segments.chains import directions
 
     frames, s, city = streets
     few = s.model_copy(update={"propagation": s.propagation.model_copy(update={"rays": 500})})
@@ -288,7 +290,7 @@ def test_chains_are_found_again_and_only_where_nothing_changed(streets, tmp_path
     """A second tracer of the same flight and city sends no ray, has no need of Sionna's scene and
     has the same chains; other rays, another flight and another mesh are searched anew. Planted bug:
     a key without the places."""
-    from isac_rt.propagation.legs.chains import Search
+    from isac_rt.propagation.segments.chains import Search
     from isac_rt.storage import KEPT
     from isac_rt.world.city import scene as scenes
 

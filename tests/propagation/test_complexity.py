@@ -50,14 +50,14 @@ def test_tracing_grows_slower_than_the_triangles():
 
 @pytest.mark.sionna
 @pytest.mark.parametrize("uavs", [3, 7])
-def test_legs_are_traced_from_terminals_only(uavs):
-    """Legs run from the two terminals to every UAV: 2 N pairs, not N^2; rays are sent by the two
-    terminals only."""
+def test_segments_are_traced_from_terminals_only(uavs):
+    """Segments run from the two terminals to every UAV: 2 N pairs, not N^2; rays are sent by the
+    two terminals only."""
     setup = prepare(town(uavs))
     tracer, searched, placed = tracer_of(setup), [], []
-    chains, legs = tracer._search.chains, tracer._images.legs
+    chains, segments = tracer._search.chains, tracer._images.segments
     tracer._search.chains = lambda name, *args: (searched.append(name), chains(name, *args))[1]
-    tracer._images.legs = lambda *args: (placed.append(legs(*args)), placed[-1])[1]
+    tracer._images.segments = lambda *args: (placed.append(segments(*args)), placed[-1])[1]
     setup.find(1)
     assert searched == tracer._terminals and len(searched) == 2
     assert [len(found) for found in placed] == [2 * uavs]
@@ -116,11 +116,11 @@ def slope(sizes, counts) -> float:
 
 
 def rays_sent(setup) -> tuple[int, int]:
-    """Rays that one frame's search sends, and the legs that its images place."""
+    """Rays that one frame's search sends, and the segments that its images place."""
     tracer, sent, placed = tracer_of(setup), [], []
-    hit, legs = tracer._search._hit, tracer._images.legs
+    hit, segments = tracer._search._hit, tracer._images.segments
     tracer._search._hit = lambda at, along: (sent.append(len(at)), hit(at, along))[1]
-    tracer._images.legs = lambda *args: (placed.append(legs(*args)), placed[-1])[1]
+    tracer._images.segments = lambda *args: (placed.append(segments(*args)), placed[-1])[1]
     setup.find(1)
     return sum(sent), sum(map(len, placed))
 
@@ -135,8 +135,8 @@ def with_terminals(count: int):
 
 @pytest.mark.sionna
 def test_work_of_tracing_grows_with_terminals_and_bounces_and_not_with_faces():
-    """Slopes of rays sent and legs placed over faces, bounces, terminals and UAVs, on logarithmic
-    scales. Planted bug: rays sent for every UAV."""
+    """Slopes of rays sent and segments placed over faces, bounces, terminals and UAVs, on
+    logarithmic scales. Planted bug: rays sent for every UAV."""
     blocks = [prepare(town(3, count)) for count in (2, 4, 6)]
     faces = [setup.city.num_faces for setup in blocks]
     rays = [rays_sent(setup)[0] for setup in blocks]
@@ -148,9 +148,9 @@ def test_work_of_tracing_grows_with_terminals_and_bounces_and_not_with_faces():
     assert 0.3 < slope([1, 2, 3], bounces) < 1.05  # rays that leave the town are not sent on
     work = [rays_sent(prepare(with_terminals(n))) for n in (2, 4, 6)]
     assert slope([2, 4, 6], [rays for rays, _ in work]) == pytest.approx(1.0, abs=0.1)
-    assert slope([2, 4, 6], [legs for _, legs in work]) == pytest.approx(1.0, abs=1e-9)
-    legs = [rays_sent(prepare(town(count)))[1] for count in (3, 5, 7)]
-    assert slope([3, 5, 7], legs) == pytest.approx(1.0, abs=1e-9)
+    assert slope([2, 4, 6], [segments for _, segments in work]) == pytest.approx(1.0, abs=1e-9)
+    segments = [rays_sent(prepare(town(count)))[1] for count in (3, 5, 7)]
+    assert slope([3, 5, 7], segments) == pytest.approx(1.0, abs=1e-9)
 
 
 @pytest.mark.sionna

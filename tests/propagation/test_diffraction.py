@@ -8,14 +8,14 @@ import pytest
 from scipy import special
 from scipy.integrate import quad
 
-from isac_rt.propagation.legs.diffraction import (
+from isac_rt.propagation.segments.diffraction import (
     LIT_REACH,
     SHADOW_REACH,
     disc,
     edge_factor,
     knife_edge,
 )
-from isac_rt.propagation.legs.discs import UavDiscs
+from isac_rt.propagation.segments.discs import UavDiscs
 
 LAMBDA = 299_792_458.0 / 77e9
 

@@ -15,9 +15,9 @@ from isac_rt import scenario as tree
 from isac_rt.document import ScenarioError, ScenarioWarning
 from isac_rt.frame.antennas import antennas_of
 from isac_rt.frame.waveform import waveform_of
-from isac_rt.propagation.legs.clearance import CLEARANCE, ClearanceWarning
-from isac_rt.propagation.legs.geometry import unfold
 from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.propagation.segments.clearance import CLEARANCE, ClearanceWarning
+from isac_rt.propagation.segments.geometry import unfold
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.methods import Auto
 from isac_rt.simulation.preflight import check_flights, warn_of_aliases
@@ -174,7 +174,7 @@ def test_sheets_that_share_an_edge():
 @pytest.mark.sionna
 def test_a_target_on_the_ground():
     """On the ground itself there is a warning; two centimetres over it the echo and the one ghost
-    per leg, to a nanometre."""
+    per segment, to a nanometre."""
     a, p, u = (0.3, 1.1, 9.3), (21.7, 7.4, 8.1), (11.3, -2.2, 0.02)
     paths = found(GROUND, a, p, u, bounces=1)
     paths = paths.select(paths.target == 2)
@@ -225,8 +225,8 @@ def test_a_target_behind_another_and_a_body_in_the_way():
 def test_a_target_inside_the_radars_own_body():
     """7 cm from the radar, whose body reaches to 20 cm: the echo of the radar equation and its two
     ghosts under the ground, to a nanometre, for a radar does not shadow itself. Sionna loses
-    everything inside such a body, and what is nearer than a centimetre. Written against: legs of
-    less than a decimetre dropped."""
+    everything inside such a body, and what is nearer than a centimetre. Written against: segments
+    of less than a decimetre dropped."""
     a, u = np.array([0.3, 1.1, 9.3]), np.array([0.34, 1.15, 9.27])
     paths = found(GROUND, a, (21.7, 7.4, 8.1), u, link=("A", "A"))
     echoes = paths.select(paths.target == 2)
@@ -310,17 +310,17 @@ def test_a_path_without_length_is_not_a_number_and_refused():
     """Zero-length segments reach no signal: a path set with a NaN cannot be made."""
     here = stage.pose((1.0, 2.0, 3.0))
     with np.errstate(all="ignore"):
-        legs = unfold(np.zeros((1, 0, 3)), np.zeros((1, 0)), here, here)
-    assert legs.length[0] == 0 and not np.isfinite(legs.rate).all()
+        segments = unfold(np.zeros((1, 0, 3)), np.zeros((1, 0)), here, here)
+    assert segments.length[0] == 0 and not np.isfinite(segments.rate).all()
     from isac_rt.propagation.pathset import make_paths
 
     with pytest.raises(ValueError, match="not finite"):
         make_paths(
             gain=np.array([np.inf]),
             delay=np.zeros(1),
-            delay_rate=legs.rate,
-            departure=legs.departure,
-            arrival=legs.arrival,
+            delay_rate=segments.rate,
+            departure=segments.departure,
+            arrival=segments.arrival,
             kind=PathKind.LINE_OF_SIGHT,
             epoch=0.0,
             tx="A",

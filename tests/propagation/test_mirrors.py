@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from truths.truths import slab_reflection
 
-from isac_rt.propagation.legs.geometry import unfold
-from isac_rt.propagation.legs.reflection import mirror_amplitude, vertical
+from isac_rt.propagation.segments.geometry import unfold
+from isac_rt.propagation.segments.reflection import mirror_amplitude, vertical
 from isac_rt.world.city import CityMesh, Material
 from isac_rt.world.swarm import Pose
 
@@ -55,13 +55,13 @@ def amplitude(
 ) -> tuple[complex, np.ndarray, float]:
     """Amplitude of the chain over the planes in turn, its corners, and its length."""
     n, d = np.array(normals, float)[None], np.array(offsets, float)[None]
-    legs = unfold(n, d, start, end)
+    segments = unfold(n, d, start, end)
     city = facets(normals, offsets, materials)
-    value = mirror_amplitude(city, n, np.arange(len(materials))[None], legs, LAMBDA)[0]
+    value = mirror_amplitude(city, n, np.arange(len(materials))[None], segments, LAMBDA)[0]
     return (
         complex(value),
-        np.vstack([start.position, legs.points[0], end.position]),
-        float(legs.length[0]),
+        np.vstack([start.position, segments.points[0], end.position]),
+        float(segments.length[0]),
     )
 
 

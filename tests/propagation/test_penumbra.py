@@ -12,8 +12,8 @@ from test_clutter_against_sionna import flown as street_of
 from test_clutter_field import LAMBDA, METAL, flown, joined, rectangle, slab
 from truths.clutter import ROUND_A_CORNER, Flight
 
-from isac_rt.propagation.legs.diffraction import edge_factor
-from isac_rt.propagation.legs.edges import ShadowEdges
+from isac_rt.propagation.segments.diffraction import edge_factor
+from isac_rt.propagation.segments.edges import ShadowEdges
 
 pytestmark = pytest.mark.sionna
 SCREEN = ((-80.0, 31.0, -90.0), (160.0, 0, 0), (0, 0, 90.0))

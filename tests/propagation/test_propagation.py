@@ -8,13 +8,13 @@ import pytest
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.propagation.free_space import FreeSpace
-from isac_rt.propagation.legs.geometry import (
+from isac_rt.propagation.pathset import PathKind
+from isac_rt.propagation.rcs import CrossSection, large_uav_db
+from isac_rt.propagation.segments.geometry import (
     edges_in_any_order,
     one_of_each_chain,
     plane_of_each_face,
 )
-from isac_rt.propagation.pathset import PathKind
-from isac_rt.propagation.rcs import CrossSection, large_uav_db
 from isac_rt.scenario.swarm import Uav
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.settings import Rcs

@@ -196,25 +196,25 @@ FOUND = {  # line of sight and mirror paths of A->P by number of bounces
 
 @pytest.mark.parametrize("name", SCENES)
 def test_every_path_of_a_scene_is_an_image_and_every_image_a_path(name):
-    """Line of sight, mirrors, and ghosts as products of legs. Seen failing with the faces of a
-    chain in reverse order, with the bounces of ghosts not counted over both legs, and with the
+    """Line of sight, mirrors, and ghosts as products of segments. Seen failing with the faces of a
+    chain in reverse order, with the bounces of ghosts not counted over both segments, and with the
     mesh's origin left out of the points."""
     *places, bounces = SCENES[name]
     poses, city = stage.swarm(*places), builtin(name)
     model, s = stage.tracer(city, bounces), stage.scenario()
     found, dropped = model.trace(poses, 0.0, LINKS)
     images = Images(city)
-    legs = {
+    segments = {
         (a, b): images.paths(poses[a].position, poses[b].position, bounces)
         for a, b in [("A", "A"), ("A", "P"), ("A", "U"), ("P", "U"), ("P", "A")]
     }
     for tx, rx in LINKS:
         paths = found[tx, rx]
         direct = np.isin(paths.kind, (PathKind.LINE_OF_SIGHT, PathKind.SPECULAR))
-        check_against(legs[tx, rx], C * paths.delay[direct], paths.bounces[direct])
+        check_against(segments[tx, rx], C * paths.delay[direct], paths.bounces[direct])
         for number, name_of in enumerate(s.swarm):
             if name_of not in (tx, rx):
-                there, back = legs[tx, name_of], legs[rx, name_of]
+                there, back = segments[tx, name_of], segments[rx, name_of]
                 expected = [
                     Chain(a.length + b.length, a.bounces + b.bounces, a.points, a.sure and b.sure)
                     for a, b in itertools.product(there, back)
@@ -352,7 +352,7 @@ def test_a_wall_far_from_the_origin_reflects_once():
     for one in (model, model.by_sionna(20_000)):
         paths = one.trace(poses, 0.0, [("A", "P")]).paths["A", "P"]
         assert paths.counts()["specular"] == 1
-    assert model._solved_legs(model._local(poses), 20_000).duplicates > 0
+    assert model._solved_segments(model._local(poses), 20_000).duplicates > 0
 
 
 def test_leakage():

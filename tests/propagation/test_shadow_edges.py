@@ -15,12 +15,12 @@ from truths.clutter import crossing
 from isac_rt import scenario
 from isac_rt.frame.link import Link
 from isac_rt.kernels.propagation_edges import MOST_TRIED, near
-from isac_rt.propagation.legs import edges as edges_of_cities
-from isac_rt.propagation.legs.direct import direct_legs
-from isac_rt.propagation.legs.discs import UavDiscs
-from isac_rt.propagation.legs.edges import Edges
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.scatter_paths import LinkState
+from isac_rt.propagation.segments import edges as edges_of_cities
+from isac_rt.propagation.segments.direct import direct_segments
+from isac_rt.propagation.segments.discs import UavDiscs
+from isac_rt.propagation.segments.edges import Edges
 from isac_rt.simulation.setup import propagation_in
 from isac_rt.world.city import CityMesh
 from isac_rt.world.city.mesh import empty_city
@@ -174,13 +174,13 @@ def test_nothing_is_switched_when_flying_round_a_corner():
     ):
         places = np.array(start) + np.arange(0.0, 28.0, 0.005)[:, None] * np.array(ahead)
         poses = {"A": a} | {str(i): pose(q) for i, q in enumerate(places)}
-        legs = direct_legs(
+        segments = direct_segments(
             poses, [("A", str(i)) for i in range(len(places))], edges, UavDiscs.of({}, {}), LAMBDA
         )
         distance = np.linalg.norm(places - a.position, axis=1)
         now = np.zeros(len(places), complex)
         for i, d in enumerate(distance):
-            found = legs.get(("A", str(i)))
+            found = segments.get(("A", str(i)))
             states.add(None if found is None else bool(np.isfinite(found[1].points).all()))
             if found is not None:
                 now[i] = found[0][0] * wave(found[1].length[0]) * 4 * np.pi * d / LAMBDA / wave(d)
@@ -193,8 +193,8 @@ def test_nothing_is_switched_when_flying_round_a_corner():
 
 def test_bodies_shadow_what_is_behind_them_and_not_themselves():
     """U near the straight path from A to P, and P near that from A to U: the line of sight and the
-    echo take a disc's factor, by strips, of the body in between; the bodies at the ends of a leg,
-    and those of radius 0, none. Planted bug: the Fresnel unit of the near end alone.
+    echo take a disc's factor, by strips, of the body in between; the bodies at the ends of a
+    segment, and those of radius 0, none. Planted bug: the Fresnel unit of the near end alone.
     """
     a, p, u = pose((0.4, -0.7, 0.3)), pose((3.1, 41.3, 1.9)), pose((1.77, 17.9, 1.15))
     d = np.linalg.norm(p.position - a.position)

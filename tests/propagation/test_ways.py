@@ -1,4 +1,4 @@
-"""Ways in two legs, and which element at which end weighs them, by hand."""
+"""Ways in two segments, and which element at which end weighs them, by hand."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import pytest
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
-from isac_rt.propagation.legs.geometry import Legs
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
+from isac_rt.propagation.segments.geometry import Segments
 from isac_rt.world.swarm import Pose
 
 COSINE = Antennas(tx_x=1, tx_z=1, rx_x=2, rx_z=2, spacing=1e-3, gain=4.0, pattern="cosine")
@@ -22,29 +22,31 @@ def unit(*v: float) -> np.ndarray:
     return np.array([v]) / np.linalg.norm(v)
 
 
-def leg(motion: tuple[float, float, float], departure: np.ndarray, arrival: np.ndarray) -> Legs:
-    """A leg of this length, rate and acceleration."""
+def segment(
+    motion: tuple[float, float, float], departure: np.ndarray, arrival: np.ndarray
+) -> Segments:
+    """A segment of this length, rate and acceleration."""
     length, rate, accel = (np.array([x]) for x in motion)
-    return Legs(length, rate, accel, departure, arrival, np.zeros((1, 0, 3)))
+    return Segments(length, rate, accel, departure, arrival, np.zeros((1, 0, 3)))
 
 
-def legs() -> tuple[Legs, Legs]:
+def segments() -> tuple[Segments, Segments]:
     return (
-        leg((17.0, 2.5, 0.3), unit(0.6, 0.8, 0), unit(-1, 0, 0)),
-        leg((29.0, -7.0, 1.1), unit(-0.8, 0, 0.6), unit(0, 1, 0)),
+        segment((17.0, 2.5, 0.3), unit(0.6, 0.8, 0), unit(-1, 0, 0)),
+        segment((29.0, -7.0, 1.1), unit(-0.8, 0, 0.6), unit(0, 1, 0)),
     )
 
 
-def test_a_way_over_a_body_adds_its_legs():
+def test_a_path_over_a_target_adds_its_segments():
     """Length, rate and acceleration of both; the wave curves about the body at either end, and
-    leaves and comes by the legs' first pieces. Planted bugs: ends exchanged; one leg's
+    leaves and comes by the segments' first pieces. Planted bugs: ends exchanged; one segment's
     acceleration."""
-    way = ScatterPaths.over(*legs())
+    way = ScatterPaths.over(*segments())
     assert (way.length[0], way.rate[0], way.accel[0]) == pytest.approx((46.0, -4.5, 1.4))
     assert (way.tx_radius[0], way.rx_radius[0]) == (17.0, 29.0)
     assert way.departure[0].tolist() == [0.6, 0.8, 0.0]
     assert way.arrival[0] == pytest.approx([-0.8, 0.0, 0.6])
-    one = ScatterPaths.along(legs()[0])
+    one = ScatterPaths.along(segments()[0])
     assert (one.length[0], one.tx_radius[0], one.rx_radius[0]) == (17.0, 17.0, 17.0)
     assert one.departure[0].tolist() == [0.6, 0.8, 0.0] and one.arrival[0].tolist() == [-1, 0, 0]
 
@@ -55,14 +57,14 @@ def test_each_end_weighs_by_its_own_axes(own):
     from; at an active terminal both in the terminal's own axes, by different directions there and
     back as over a wall. Planted bugs: the arrival in the sender's axes; the departure's gain
     twice."""
-    way = ScatterPaths.over(*legs())
+    way = ScatterPaths.over(*segments())
     end = SENDER if own else HEARER
     state = LinkState(Link("A", "A" if own else "B"), 0.0, SENDER, end)
     arrival = 4 * max(way.arrival[0] @ end.rotation[:, 1], 0)
     assert arrival == pytest.approx(0.0 if own else 3.2)
     assert state.elements(COSINE, way)[0] == pytest.approx(np.sqrt(3.2 * arrival))
-    there = legs()[0]
-    bent = ScatterPaths.over(there, leg((29.0, -7.0, 1.1), unit(0, 0.6, 0.8), unit(0, 1, 0)))
+    there = segments()[0]
+    bent = ScatterPaths.over(there, segment((29.0, -7.0, 1.1), unit(0, 0.6, 0.8), unit(0, 1, 0)))
     straight = ScatterPaths.over(there, there)
     if own:
         assert state.elements(COSINE, bent)[0] == pytest.approx(np.sqrt(3.2 * 2.4))
@@ -72,7 +74,7 @@ def test_each_end_weighs_by_its_own_axes(own):
 def test_paths_are_their_ways_over_the_speed_of_light():
     """Delays, directions and radii of the paths, their names and what happens on them. Planted
     bugs: metres for seconds; directions exchanged."""
-    way = ScatterPaths.over(*legs())
+    way = ScatterPaths.over(*segments())
     state = LinkState(Link("A", "B"), 0.7, SENDER, HEARER, ("T", "U"))
     points, faces = np.array([[[1.0, 2, 3]]]), np.array([[5]])
     p = state.paths(

@@ -218,8 +218,8 @@ def test_ledger_holds_every_path_of_every_link(tmp_path, run):
 
 @pytest.mark.sionna
 def test_points_of_paths_make_their_lengths():
-    """Transmitter, points, receiver: the legs' sum over the speed of light is the delay, to 1e-9 m.
-    Planted bug: points of one link under the rows of another."""
+    """Transmitter, points, receiver: the segments' sum over the speed of light is the delay, to
+    1e-9 m. Planted bug: points of one link under the rows of another."""
     made = simulate.run(load(CANYON, ["receiver_preset=plain"], frames=4), snapshots=1).dataset
     names, spot = list(made.uav.values), made.uav_position.values
     for k in range(0, made.sizes["path"], 37):

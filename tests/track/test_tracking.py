@@ -70,7 +70,7 @@ def test_measurement_by_hand():
 
 @pytest.mark.parametrize("transmitter", [None, AT])
 def test_rate_is_the_derivative_of_range(transmitter):
-    """Central difference over time of the first component; planted bug: rate of the outward leg
+    """Central difference over time of the first component; planted bug: rate of the outward segment
     left out."""
     h = 1e-4
 

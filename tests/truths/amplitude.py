@@ -187,13 +187,13 @@ def reflection_of_a_slab() -> Errors:
 
 
 @traced(
-    "image theory: the radar equation with one leg folded",
+    "image theory: the radar equation with one segment folded",
     "1e-13 relative",
     "the truth holds the 0.9991 of the tracer's metal per bounce; " + ROUNDING,
 )
 def ghosts_over_a_conducting_wall() -> float:
     """Echo and ghosts of a target beside a metal wall: each is a product of a straight and a folded
-    leg."""
+    segment."""
     wall = stage.rectangle(
         (-60, 25.0, -40), (120, 0, 0), (0, 0, 80), stage.material(conductivity=stage.METAL)
     )
@@ -317,7 +317,7 @@ def lambertian_wall_by_way_of_the_ground() -> float:
 def reflectivity_of_scatterers() -> Errors:
     """Power reflectivity of a slab for both polarisations, from grazing to upright incidence, as
     the clutter field uses it."""
-    from isac_rt.propagation.legs.reflection import slab_coefficients
+    from isac_rt.propagation.segments.reflection import slab_coefficients
 
     cosines = np.array([0.03, 0.21, 0.5, 0.83, 1.0])
     for eps, sigma, thickness in ((5.31, 1.9, 0.1), (6.31, 1.21, 0.012)):

@@ -98,7 +98,7 @@ def paths_missed_in_a_city() -> float:
 @slow_traced(
     "Sionna RT's own RCSSolver with a body in the scene",
     "0.01 relative",
-    "what turns horizontal on one leg and back on the other is left out here, 0.23 % at most",
+    "what turns horizontal on one segment and back on the other is left out here, 0.23 % at most",
 )
 def echoes_against_sionna() -> float:
     """Echo and ghosts of a target over floor and wall: the same paths with the same complex

@@ -13,8 +13,8 @@ from isac_rt import scenario as tree
 from isac_rt.extensions.city_files.extrude import building
 from isac_rt.frame.link import Link
 from isac_rt.propagation.free_space import FreeSpace
-from isac_rt.propagation.legs.geometry import Legs, plane_of_each_face, straight, unfold
 from isac_rt.propagation.pathset import PathKind
+from isac_rt.propagation.segments.geometry import Segments, plane_of_each_face, straight, unfold
 from isac_rt.world.city import load_city
 from isac_rt.world.city.georeference import LONLAT, GeoReference, plane_about
 from isac_rt.world.city.materials import MaterialUse
@@ -37,7 +37,7 @@ RX = ((23.9, 17.3, 8.77), (-6.2, 2.9, 3.1), (-1.3, 0.4, 0.9))
 BODY = ((9.7, 31.1, 14.9), (3.7, 8.3, -2.2), (2.1, -0.6, 1.7))
 
 
-def _unfolded(planes: tuple, start: Pose, end: Pose) -> Legs:
+def _unfolded(planes: tuple, start: Pose, end: Pose) -> Segments:
     normals = np.array([np.array(n, float) / np.linalg.norm(n) for n, _ in planes]).reshape(
         1, -1, 3
     )
@@ -93,11 +93,11 @@ def delay_of_the_line_of_sight() -> Errors:
 def delay_over_the_ground() -> Errors:
     """The ground's reflection is the image under the ground, from 1 m to 1 km."""
     for d in (1.013, 9.87, 101.3, 997.7):
-        legs = _unfolded(
+        segments = _unfolded(
             (((0, 0, 1), (3.3, 1.7, 0.41)),), stage.pose((0, 0, 9.87)), stage.pose((d, 0, 4.31))
         )
         h = wide([9.87, 4.31]).sum() - 2 * np.longdouble(0.41)
-        yield abs(legs.length[0] - np.sqrt(np.longdouble(d) ** 2 + h * h))
+        yield abs(segments.length[0] - np.sqrt(np.longdouble(d) ** 2 + h * h))
 
 
 @case("Householder matrix in long double", "1e-9 m", NANOMETRE)
@@ -124,10 +124,10 @@ def corner_of_three_right_angles() -> float:
     to the corner."""
     turn, _ = np.linalg.qr(np.random.default_rng(5).standard_normal((3, 3)))
     corner, radar = np.array([31.3, -24.7, 13.9]), np.array([9.3, 13.1, 7.7])
-    legs = _unfolded(tuple((n, corner) for n in turn), stage.pose(radar), stage.pose(radar))
+    segments = _unfolded(tuple((n, corner) for n in turn), stage.pose(radar), stage.pose(radar))
     away = float(truths.norm(wide(radar) - wide(corner)))
-    straight_back = float(np.abs(legs.departure[0] - legs.arrival[0]).max()) * away
-    return max(abs(legs.length[0] - 2 * away), straight_back)
+    straight_back = float(np.abs(segments.departure[0] - segments.arrival[0]).max()) * away
+    return max(abs(segments.length[0] - 2 * away), straight_back)
 
 
 @case(
@@ -166,26 +166,26 @@ def city_100_km_from_the_origin() -> float:
         int(np.argmax((city.corners + city.origin - far).mean(axis=1) @ n))
         for n in ((0, 1, 0), (1, 0, 0))
     ]
-    legs = unfold(
+    segments = unfold(
         normals[order][None],
         offsets[order][None],
         *(stage.pose(far + p - city.origin) for p in (start, end)),
     )
-    return float(abs(legs.length[0] - truth))
+    return float(abs(segments.length[0] - truth))
 
 
 @case("derivative of the long-double length", "1e-5 Hz", DIFFERENCE)
 def doppler_of_a_moving_transmitter() -> float:
     """Doppler of the line of sight when only the transmitter flies (a receding one is negative)."""
-    legs = straight(stage.pose(*TX), np.array([RX[0]]))
-    return _doppler_error(legs.rate[0] / C, lambda t: truths.norm(wide(RX[0]) - flown(*TX, t)))
+    segments = straight(stage.pose(*TX), np.array([RX[0]]))
+    return _doppler_error(segments.rate[0] / C, lambda t: truths.norm(wide(RX[0]) - flown(*TX, t)))
 
 
 @case("derivative of the long-double length", "1e-5 Hz", DIFFERENCE)
 def doppler_of_a_moving_receiver() -> float:
     """Doppler of the line of sight when only the receiver flies."""
-    legs = straight(stage.pose(TX[0]), np.array([RX[0]]), np.array(RX[1]), np.array(RX[2]))
-    return _doppler_error(legs.rate[0] / C, lambda t: truths.norm(flown(*RX, t) - wide(TX[0])))
+    segments = straight(stage.pose(TX[0]), np.array([RX[0]]), np.array(RX[1]), np.array(RX[2]))
+    return _doppler_error(segments.rate[0] / C, lambda t: truths.norm(flown(*RX, t) - wide(TX[0])))
 
 
 @case("derivative of the long-double length over the wall where it then is", "1e-5 Hz", DIFFERENCE)
@@ -194,12 +194,12 @@ def doppler_of_a_moving_reflector() -> float:
     across while both ends rest."""
     w = np.array([3.3, -5.7, 1.1])
     normal, point = SIDE
-    legs = _unfolded((SIDE,), stage.pose(TX[0], -w), stage.pose(RX[0], -w))
+    segments = _unfolded((SIDE,), stage.pose(TX[0], -w), stage.pose(RX[0], -w))
 
     def length(t: np.longdouble) -> np.longdouble:
         return chain_length(((normal, wide(point) + t * wide(w)),), wide(TX[0]), wide(RX[0]))
 
-    return _doppler_error(legs.rate[0] / C, length)
+    return _doppler_error(segments.rate[0] / C, length)
 
 
 @case("derivative of the long-double length", "1e-5 Hz", DIFFERENCE)
@@ -218,7 +218,7 @@ def doppler_of_a_moving_target() -> float:
 
 @case("derivative of the long-double length", "1e-5 Hz", DIFFERENCE)
 def doppler_of_a_scatterer() -> float:
-    """Doppler over a scatterer at rest when both ends fly: the sum of two legs."""
+    """Doppler over a scatterer at rest when both ends fly: the sum of two segments."""
     point = np.array([-11.3, 24.1, 5.7])
     rate = sum(straight(stage.pose(*end), point[None]).rate[0] for end in (TX, RX)) / C
     return _doppler_error(

@@ -153,7 +153,7 @@ def test_scattering_patterns_reach_sionna():
 def test_shadow_rays_meet_the_faces_that_sionnas_do():
     """Of random rays in a street, those of the scene without materials are stopped as Sionna's are,
     and the latter is made only when it is asked for. Seen failing with the roofs left out."""
-    from isac_rt.propagation.legs.rays import Shadows
+    from isac_rt.propagation.segments.rays import Shadows
     from isac_rt.world.city import scene as scenes
 
     city = load_city(

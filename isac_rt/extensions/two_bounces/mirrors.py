@@ -22,9 +22,9 @@ import numpy as np
 
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.clutter.visibility import Flight
-from isac_rt.propagation.legs.geometry import RAY_OFFSET_M, plane_of_each_face
-from isac_rt.propagation.legs.rays import Shadows
-from isac_rt.propagation.legs.reflection import slab_coefficients
+from isac_rt.propagation.segments.geometry import RAY_OFFSET_M, plane_of_each_face
+from isac_rt.propagation.segments.rays import Shadows
+from isac_rt.propagation.segments.reflection import slab_coefficients
 from isac_rt.world.city.materials import Material
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.mirrors import mirror_image, over_triangle, plane_crossing
@@ -135,7 +135,7 @@ def shown(
 ) -> list[np.ndarray]:
     """Indices of those points (N, 3) on surfaces with normals (N, 3) that each mirror shows.
 
-    The wave must meet the mirror on one of its faces, and both legs must be free.
+    The wave must meet the mirror on one of its faces, and both segments must be free.
     """
     found = [on_the_wall(points, position, m.normal, m.offset, m.corners) for m in mirrors]
     which = np.concatenate([f[0] for f in found])

@@ -15,7 +15,7 @@ vertical, as for one bounce.
 
 On a terminal's link to itself the two orders are one way and its reverse: equal in length, and in
 phase where transmitter and receiver share one place, as backscatter is enhanced in nature. Sight by
-way of a mirror is tested at the time samples of the flight, both legs and the mirror's rim, and
+way of a mirror is tested at the time samples of the flight, both segments and the mirror's rim, and
 blended in between.
 
 Import only after `isac_rt.runtime.activate()`.
@@ -35,10 +35,10 @@ from isac_rt.propagation.clutter.field import (
     motion_to,
     scattered_power,
 )
-from isac_rt.propagation.legs.discs import UavDiscs
-from isac_rt.propagation.legs.reflection import mirrored_field, slab_coefficients, vertical
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.scatter_paths import LinkState
+from isac_rt.propagation.segments.discs import UavDiscs
+from isac_rt.propagation.segments.reflection import mirrored_field, slab_coefficients, vertical
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.mirrors import mirror_image, plane_crossing
 from isac_rt.world.swarm import Pose

@@ -55,11 +55,11 @@ from isac_rt.propagation.clutter.merging import (
 from isac_rt.propagation.clutter.overlaps import lies_twice
 from isac_rt.propagation.clutter.penumbra import Facets
 from isac_rt.propagation.clutter.visibility import SAMPLE_SPACING, Flight, Visibility, ever_ahead
-from isac_rt.propagation.legs.discs import UavDiscs
-from isac_rt.propagation.legs.rays import Shadows
-from isac_rt.propagation.legs.reflection import slab_coefficients
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
+from isac_rt.propagation.segments.discs import UavDiscs
+from isac_rt.propagation.segments.rays import Shadows
+from isac_rt.propagation.segments.reflection import slab_coefficients
 from isac_rt.storage import kept
 from isac_rt.world.city.materials import Material
 from isac_rt.world.city.mesh import CityMesh

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from isac_rt.propagation.clutter.cells import Cells
-from isac_rt.propagation.legs.geometry import RAY_OFFSET_M
+from isac_rt.propagation.segments.geometry import RAY_OFFSET_M
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.mirrors import over_triangle
 

@@ -23,9 +23,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from isac_rt.propagation.legs.diffraction import knife_edge
-from isac_rt.propagation.legs.geometry import RAY_OFFSET_M
-from isac_rt.propagation.legs.rays import Triangles, computed, rays
+from isac_rt.propagation.segments.diffraction import knife_edge
+from isac_rt.propagation.segments.geometry import RAY_OFFSET_M
+from isac_rt.propagation.segments.rays import Triangles, computed, rays
 
 HALVINGS = 6
 """Bisections between two time samples: 8 mm of half a metre."""

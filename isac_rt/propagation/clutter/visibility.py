@@ -19,7 +19,7 @@ from scipy.interpolate import BSpline
 
 from isac_rt.propagation.clutter.penumbra import REACH as PENUMBRA
 from isac_rt.propagation.clutter.penumbra import Crossings, Facets, crossings, penumbra
-from isac_rt.propagation.legs.rays import Shadows
+from isac_rt.propagation.segments.rays import Shadows
 from isac_rt.storage import checksum, kept, pack
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Trajectory

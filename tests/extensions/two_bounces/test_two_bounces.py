@@ -169,21 +169,21 @@ def test_each_way_against_an_oracle(pattern):
                     np.abs(paths.points[i] - chain).max() < 1e-3
                 )  # Fermat's minimum is flat: the root of its tolerance
                 stops = [start.position, *paths.points[i], end.position]
-                legs = [(b - a) / np.linalg.norm(b - a) for a, b in pairwise(stops)]
+                segments = [(b - a) / np.linalg.norm(b - a) for a, b in pairwise(stops)]
                 if part.before:
-                    field, _ = reflected(upright(legs[0]), legs[0], level, soil)
-                    gain = scattered(field, legs[1], legs[2], upward, facet, area)
+                    field, _ = reflected(upright(segments[0]), segments[0], level, soil)
+                    gain = scattered(field, segments[1], segments[2], upward, facet, area)
                 else:
-                    passed, out = reflected(upright(legs[1]), legs[1], level, soil)
+                    passed, out = reflected(upright(segments[1]), segments[1], level, soil)
                     gain = scattered(
-                        upright(legs[0]), legs[0], legs[1], upward, facet, area
+                        upright(segments[0]), segments[0], segments[1], upward, facet, area
                     ) * complex(passed @ upright(out))
                 gain *= (
                     LAMBDA / (4 * np.pi) / (way * r) * complex(model.field.cells.amplitude[cell])
                 )
                 assert abs(paths.gain[i] / gain - 1) < 3e-4  # the slab's table, 4096 angles
-                assert part.seen.departure[i] == pytest.approx(legs[0], abs=1e-12)
-                assert part.seen.arrival[i] == pytest.approx(-legs[2], abs=1e-12)
+                assert part.seen.departure[i] == pytest.approx(segments[0], abs=1e-12)
+                assert part.seen.arrival[i] == pytest.approx(-segments[2], abs=1e-12)
                 lengths = []
                 for t in (-1e-3, 0.0, 1e-3):
                     a, b = place(start, t), place(end, t)

@@ -1,12 +1,11 @@
-"""Reflection of a vertically polarised wave: slab coefficients along sequences of walls, in
-float64."""
+"""Reflection of a vertically polarised wave: slab coefficients along wall sequences."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
-from isac_rt.propagation.legs.geometry import Legs
+from isac_rt.propagation.segments.geometry import Segments
 from isac_rt.world.city.materials import VACUUM_PERMITTIVITY, Material
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.mirrors import mirror_image
@@ -65,7 +64,7 @@ def mirrored_field(
 
 
 def mirror_amplitude(
-    city: CityMesh, normals: np.ndarray, faces: np.ndarray, legs: Legs, wavelength: float
+    city: CityMesh, normals: np.ndarray, faces: np.ndarray, segments: Segments, wavelength: float
 ) -> np.ndarray:
     """(K,) complex amplitudes of unfolded chains between isotropic vertical elements, without the
     carrier phase.
@@ -74,11 +73,11 @@ def mirror_amplitude(
     ----------
     normals : (K, B, 3) unit normals of the chains' planes
     faces : (K, B) faces, which say the material
-    legs : K legs
+    segments : K segments
     """
     count, depth = faces.shape
-    field = vertical(legs.departure).astype(complex)
-    along = legs.departure
+    field = vertical(segments.departure).astype(complex)
+    along = segments.departure
     for b in range(depth):
         normal = normals[:, b]
         cosine = np.minimum(np.abs((along * normal).sum(1)), 1.0)
@@ -90,4 +89,4 @@ def mirror_amplitude(
         out = mirror_image(along, normal)
         field = mirrored_field(field, along, out, normal, te, tm)
         along = out
-    return (field * vertical(legs.arrival)).sum(1) * wavelength / (4 * np.pi * legs.length)
+    return (field * vertical(segments.arrival)).sum(1) * wavelength / (4 * np.pi * segments.length)

@@ -4,10 +4,10 @@ stretch of flight.
 Rays leave a terminal from time samples, places at even distances along its planned flight, in
 directions that differ from time sample to time sample, and are mirrored at each wall that they hit.
 What they find are chains of planes, whatever the UAV that they lead to. The chains of the time
-samples about an instant are pooled; images then say which of them are paths (`legs.images`). Time
-samples, directions and pools are functions of the plan of the flight: a frame is the same whether
-others were computed before it or not. From a place off the plan as many rays are sent as from the
-time samples of a pool together.
+samples about an instant are pooled; images then say which of them are paths (`segments.images`).
+Time samples, directions and pools are functions of the plan of the flight: a frame is the same
+whether others were computed before it or not. From a place off the plan as many rays are sent as
+from the time samples of a pool together.
 
 Local coordinates. Import only after `isac_rt.runtime.activate()`.
 """
@@ -23,8 +23,8 @@ import mitsuba as mi
 import numpy as np
 
 from isac_rt.propagation.clutter.visibility import Flight
-from isac_rt.propagation.legs.geometry import RAY_OFFSET_M
-from isac_rt.propagation.legs.rays import rays
+from isac_rt.propagation.segments.geometry import RAY_OFFSET_M
+from isac_rt.propagation.segments.rays import rays
 from isac_rt.storage import checksum, kept, pack
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.city.scene import CityScenes

@@ -1,5 +1,4 @@
-"""The swarm's own UAVs in the way of waves: each an opaque disc across the path, with its Fresnel
-shadow."""
+"""Obstruction by the swarm's own UAVs: each is an opaque disc with its Fresnel shadow."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from isac_rt.kernels import propagation_discs
 from isac_rt.kernels.jit import twin_of
-from isac_rt.propagation.legs.diffraction import LIT_REACH, disc, fresnel_unit, tapered
+from isac_rt.propagation.segments.diffraction import LIT_REACH, disc, fresnel_unit, tapered
 from isac_rt.world.settings import Uav
 from isac_rt.world.swarm import Pose
 
@@ -38,9 +37,8 @@ class UavDiscs:
         return cls(names, positions, np.array([uavs[name].body_radius_m for name in names]))
 
     def spared(self, names: Sequence[Collection[str]]) -> np.ndarray:
-        """(R, N) which UAVs are at the ends of each of R legs, or echo: a body does not shadow
-        itself."""
-        rows = [[uav in of_leg for uav in self.names] for of_leg in names]
+        """(R, N) bool: the UAV ends or scatters the segment, so that it does not shadow it."""
+        rows = [[uav in of_segment for uav in self.names] for of_segment in names]
         return np.array(rows, bool).reshape(len(rows), len(self.names))
 
     def factor(self, chain: np.ndarray, wavelength: float, spared: np.ndarray) -> np.ndarray:

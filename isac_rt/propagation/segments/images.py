@@ -27,18 +27,18 @@ from isac_rt.frame.link import Link
 from isac_rt.kernels import propagation_images
 from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.propagation_images import WIDER
-from isac_rt.propagation.legs.chains import Chains
-from isac_rt.propagation.legs.geometry import (
+from isac_rt.propagation.segments.chains import Chains
+from isac_rt.propagation.segments.geometry import (
     RAY_OFFSET_M,
-    Legs,
+    Segments,
     edges_in_any_order,
     one_of_each_chain,
     plane_of_each_face,
     unfold,
 )
-from isac_rt.propagation.legs.legset import LegSet, leg_set
-from isac_rt.propagation.legs.rays import Shadows
-from isac_rt.propagation.legs.reflection import mirror_amplitude
+from isac_rt.propagation.segments.rays import Shadows
+from isac_rt.propagation.segments.reflection import mirror_amplitude
+from isac_rt.propagation.segments.segment_set import SegmentSet, segment_set
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.mirrors import mirror_image, plane_crossing
 from isac_rt.world.swarm import Pose
@@ -124,14 +124,14 @@ class _Candidates:
     pair : (K,) number of the pair
     faces : (K, B)
     normals : (K, B, 3)
-    legs : to the end of the pair
+    segments : to the end of the pair
     stops : (K, B + 2, 3) places that each visits in turn, to the end or to the place beside it
     """
 
     pair: np.ndarray
     faces: np.ndarray
     normals: np.ndarray
-    legs: Legs
+    segments: Segments
     stops: np.ndarray
 
 
@@ -151,7 +151,9 @@ class Images:
         self._depth, self._mirrors = depth, Mirrors.of(city)
         self._planes = plane_of_each_face(city)
 
-    def legs(self, chains: Mapping[str, Chains], local: Mapping[str, Pose]) -> dict[Link, LegSet]:
+    def segments(
+        self, chains: Mapping[str, Chains], local: Mapping[str, Pose]
+    ) -> dict[Link, SegmentSet]:
         """Mirror reflections from the terminals that `chains` names to all UAVs, for their poses;
         sorted by bounces and length."""
         pairs = [Link(start, end) for start in chains for end in local]
@@ -189,18 +191,19 @@ class Images:
         elsewhere than to the terminal itself."""
         normals, offsets = (values[faces] for values in self._planes)
         start, end = (_stacked(motion[pair, side]) for side in (0, 1))
-        legs = unfold(normals, offsets, start, end)
+        segments = unfold(normals, offsets, start, end)
         aside = beside >= 0
         tip = end.position + np.where(aside[:, None], PROBES_M[beside], 0.0)
-        points = legs.points.copy()
+        points = segments.points.copy()
         there = _stacked(motion[pair[aside], 1])
         there = replace(there, position=tip[aside])
         begin = _stacked(motion[pair[aside], 0])
         points[aside] = unfold(normals[aside], offsets[aside], begin, there).points
-        distance = np.linalg.norm(legs.points - points, axis=2).max(axis=1, initial=0.0)
+        distance = np.linalg.norm(segments.points - points, axis=2).max(axis=1, initial=0.0)
         stops = np.concatenate([start.position[:, None], points, tip[:, None]], axis=1)
-        keep = np.flatnonzero(distance < SLACK + STRETCH * legs.length)
-        return _Candidates(pair[keep], faces[keep], normals[keep], legs.select(keep), stops[keep])
+        keep = np.flatnonzero(distance < SLACK + STRETCH * segments.length)
+        found = segments.select(keep)
+        return _Candidates(pair[keep], faces[keep], normals[keep], found, stops[keep])
 
     def _clear(self, parts: list[_Candidates]) -> list[np.ndarray]:
         """(K,) of each part, whether nothing stands in the way."""
@@ -218,22 +221,22 @@ class Images:
 
     def _settled(
         self, parts: list[_Candidates], clear: list[np.ndarray], pairs: list[Link]
-    ) -> dict[Link, LegSet]:
+    ) -> dict[Link, SegmentSet]:
         """Return each path once, sorted by pair, bounces and length, with its amplitudes."""
         sets, owners = [], []
         for part, good in zip(parts, clear, strict=True):
-            planes = edges_in_any_order(self._city.plane_of_face[part.faces], part.legs.points)
+            planes = edges_in_any_order(self._city.plane_of_face[part.faces], part.segments.points)
             owned = np.column_stack([part.pair, planes])
             keep = one_of_each_chain(owned, part.faces, good)
-            legs, faces = part.legs.select(keep), part.faces[keep]
+            segments, faces = part.segments.select(keep), part.faces[keep]
             amplitude = mirror_amplitude(
-                self._city, part.normals[keep], faces, legs, self._wavelength
+                self._city, part.normals[keep], faces, segments, self._wavelength
             )
-            sets.append((amplitude, legs, faces, planes[keep]))
+            sets.append((amplitude, segments, faces, planes[keep]))
             owners.append(part.pair[keep])
-        width = max(self._depth, 1)  # a straight leg may bend round one point
-        every, owner = leg_set(sets, width), np.concatenate([np.zeros(0, int), *owners])
-        order = np.lexsort([every.legs.length, every.bounces, owner])
+        width = max(self._depth, 1)  # a straight segment may bend round one point
+        every, owner = segment_set(sets, width), np.concatenate([np.zeros(0, int), *owners])
+        order = np.lexsort([every.segments.length, every.bounces, owner])
         edges = np.searchsorted(owner[order], np.arange(len(pairs) + 1))
         rows = [order[a:b] for a, b in itertools.pairwise(edges)]
         return {pair: every.select(which) for pair, which in zip(pairs, rows, strict=True)}
@@ -245,8 +248,8 @@ def _stacked(motion: np.ndarray) -> Pose:
 
 
 def _lifted(stops: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return starts and ends (K, B + 1, 3) of the paths' segments, `RAY_OFFSET_M` off the walls on
-    the path's side."""
+    """Return starts and ends (K, B + 1, 3) of the paths' straight pieces, `RAY_OFFSET_M` off the
+    walls on the path's side."""
     lift = np.zeros_like(stops)
     side = np.sign(((stops[:, :-2] - stops[:, 1:-1]) * normals).sum(2))
     lift[:, 1:-1] = RAY_OFFSET_M * side[..., None] * normals

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from isac_rt.propagation.legs.geometry import RAY_OFFSET_M
+from isac_rt.propagation.segments.geometry import RAY_OFFSET_M
 
 CHUNK = 1 << 20
 

@@ -1,4 +1,4 @@
-"""Path geometry in float64: mirror images, and straight legs to a moving point.
+"""Path geometry in float64: mirror images, and straight segments to a moving point.
 
 A chain of mirror reflections is unfolded: the transmitter's image behind the chain's planes sends
 straight to the receiver. Length, rate and acceleration follow from the relative motion of the image
@@ -21,12 +21,12 @@ rays are good to a tenth of it."""
 
 
 @dataclass(frozen=True)
-class Legs:
-    """K straight (or unfolded) legs from one body to another. World axes, metres.
+class Segments:
+    """K straight (or unfolded) segments from one body to another. World axes, metres.
 
     Attributes
     ----------
-    length, rate, accel : (K,) of the leg's length [m, m/s, m/s^2]
+    length, rate, accel : (K,) of the segment's length [m, m/s, m/s^2]
     departure : (K, 3) unit vectors along the first segment, at the start
     arrival : (K, 3) unit vectors at the end, towards where the wave comes from
     points : (K, B, 3) interaction points in order
@@ -39,15 +39,15 @@ class Legs:
     arrival: np.ndarray
     points: np.ndarray
 
-    def select(self, which: np.ndarray | slice) -> Legs:
-        """The legs that an index array or a slice chooses."""
+    def select(self, which: np.ndarray | slice) -> Segments:
+        """The segments that an index array or a slice chooses."""
         if isinstance(which, slice):
-            return Legs(*(array[which] for array in vars(self).values()))
-        return Legs(*(array.take(which, axis=0) for array in vars(self).values()))
+            return Segments(*(array[which] for array in vars(self).values()))
+        return Segments(*(array.take(which, axis=0) for array in vars(self).values()))
 
 
-def unfold(normals: np.ndarray, offsets: np.ndarray, start: Pose, end: Pose) -> Legs:
-    """Legs from `start` to `end` over chains of B mirrors at rest.
+def unfold(normals: np.ndarray, offsets: np.ndarray, start: Pose, end: Pose) -> Segments:
+    """Segments from `start` to `end` over chains of B mirrors at rest.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def unfold(normals: np.ndarray, offsets: np.ndarray, start: Pose, end: Pose) -> 
 
     Returns
     -------
-    Legs; `points` lie on the planes (not checked against the faces' edges)
+    Segments; `points` lie on the planes (not checked against the faces' edges)
     """
     count, depth = offsets.shape
     image = np.broadcast_to(start.position, (count, 3)).copy()
@@ -83,7 +83,7 @@ def unfold(normals: np.ndarray, offsets: np.ndarray, start: Pose, end: Pose) -> 
     first = points[:, 0] if depth else np.broadcast_to(end.position, (count, 3))
     departure = first - start.position
     departure = departure / np.linalg.norm(departure, axis=1, keepdims=True)
-    return Legs(length, rate, accel, departure, -e, points)
+    return Segments(length, rate, accel, departure, -e, points)
 
 
 def straight(
@@ -91,16 +91,16 @@ def straight(
     points: np.ndarray,
     velocity: np.ndarray | float = 0.0,
     acceleration: np.ndarray | float = 0.0,
-) -> Legs:
-    """Legs from `start` to points (K, 3) that move with `velocity` and `acceleration` (K, 3 or one
-    for all)."""
+) -> Segments:
+    """Segments from `start` to points (K, 3) that move with `velocity` and `acceleration` (K, 3 or
+    one for all)."""
     span = points - start.position
     length = np.linalg.norm(span, axis=1)
     e = span / length[:, None]
     w, a = velocity - start.velocity, acceleration - start.acceleration
     rate = (e * w).sum(1)
     accel = ((w * w).sum(-1) - rate**2) / length + (e * a).sum(1)
-    return Legs(length, rate, accel, e, -e, np.zeros((points.shape[0], 0, 3)))
+    return Segments(length, rate, accel, e, -e, np.zeros((points.shape[0], 0, 3)))
 
 
 def plane_of_each_face(city: CityMesh) -> tuple[np.ndarray, np.ndarray]:

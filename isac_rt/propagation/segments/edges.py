@@ -19,8 +19,8 @@ import numpy as np
 from isac_rt.kernels import propagation_edges
 from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.propagation_edges import MOST_TRIED
-from isac_rt.propagation.legs.diffraction import LIT_REACH, SHADOW_REACH
-from isac_rt.propagation.legs.rays import Shadows
+from isac_rt.propagation.segments.diffraction import LIT_REACH, SHADOW_REACH
+from isac_rt.propagation.segments.rays import Shadows
 from isac_rt.world.city.mesh import CityMesh
 
 BESIDE = 0.01

@@ -52,8 +52,7 @@ def _beside(
     positions: np.ndarray,
     most: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the places (K, 3) and the faces (F,) in whose planes and boxes, but for so much, they
-    lie: numbers of both."""
+    """Find positions (K, 3) within a margin of faces (F,): numbers of both."""
     near = np.abs(normals @ positions.T - offsets[:, None]) < most
     face, place = np.nonzero(near)
     here = positions[place]
