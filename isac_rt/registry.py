@@ -149,6 +149,8 @@ EXTENSIONS = {
     "calibrated": "isac_rt.extensions.hardware.calibrate:ideal",
     "map_files": "isac_rt.extensions.city_files.tables:table_files",
     "map_buildings": "isac_rt.extensions.city_files.footprints:footprints",
+    "flight_log": "isac_rt.extensions.flights.logs:flight_log",
+    "antenna_pattern": "isac_rt.extensions.antenna_files.patterns:antenna_pattern",
     "map_georeference": "isac_rt.extensions.city_files.footprints:located",
 }
 """Parts that the core takes from its extensions: "module:object" by what it is there."""

@@ -7,6 +7,7 @@ else.
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import traceback
@@ -165,6 +166,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str]) -> int:
     settle_process()
     warnings.showwarning = _say_warning  # type: ignore[assignment]  # fewer arguments, by *_
+    taken = logging.getLogger("isac_rt.taken")  # what was read of logs and patterns
+    taken.handlers = [logging.StreamHandler()]
+    taken.setLevel(logging.INFO)
     try:
         shut_out_working_folder()
         status = app(

@@ -398,8 +398,9 @@ class Array(Node):
     """Gain of one element by azimuth and elevation, relative to `element_gain_dbi` [dB], for
     `table`."""
     pattern_file: str | None = None
-    """CSV file with the columns azimuth_deg, elevation_deg and dbi, a row for each direction of a
-    grid, in place of `pattern`; the path is relative to the scenario's folder."""
+    """File of the pattern in place of `pattern`: CSV with azimuth_deg, elevation_deg, dbi of a
+    grid, or with two cuts, `.msi` of Planet, or a table of HFSS. The path is relative to the
+    scenario's folder."""
     element_gain_dbi: Decibels = 5.0
     """Gain of one element on boresight [dBi]. The limit is the directivity of the pattern: 0 with
     `isotropic`, 4.36 with `sector` of 120 degrees. The default is that of a patch antenna."""

@@ -1,11 +1,12 @@
-"""Tables that a scenario names as CSV files: read into its tree, so that what is kept of a run, a
-path or a point of a sweep depends on their numbers and needs the files no more."""
+"""Tables and logs that a scenario names as files: read into its tree, so that what is kept of a
+run, a path or a point of a sweep depends on their numbers and needs the files no more."""
 
 from __future__ import annotations
 
 import copy
 import csv
 import io
+import logging
 import math
 import stat
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from isac_rt.frame.boards import BOARD_FILES, BoardFileError, read_board
+from isac_rt.registry import extension
 from isac_rt.scenario.sensors import completed
 from isac_rt.settings import Key, Problem
 from isac_rt.world.settings import City
@@ -25,6 +27,8 @@ from isac_rt.world.settings import City
 if TYPE_CHECKING:
     from isac_rt.world.city.georeference import GeoReference
 
+TAKEN = logging.getLogger("isac_rt.taken")
+"""Says in a line what was taken of a log or a pattern; the command line prints it."""
 MAX_BYTES = 4_000_000
 MAX_ROWS = 20_000
 MAX_WAYPOINTS = 5_000
@@ -60,15 +64,16 @@ def read_csv(
     needed: tuple[str, ...],
     optional: tuple[str, ...] = (),
     otherwise: tuple[str, ...] = (),
+    most: int = MAX_ROWS,
 ) -> dict[str, list[float]]:
     r"""Columns of a CSV file with a header: finite numbers, by comma or semicolon.
 
     Parameters
     ----------
-    path : of a regular file of at most 4 MB and 20,000 rows; lines that begin with # are passed
-        over
+    path : of a regular file of at most 4 MB; lines that begin with # are passed over
     needed, optional : names of the columns, in any order
     otherwise : columns that may stand in place of those `needed`
+    most : rows
 
     Raises
     ------
@@ -83,14 +88,7 @@ def read_csv(
     ...     read_csv(file, ("x", "z"))
     {'x': [0.0, 0.5], 'z': [0.0, 0.0]}
     """
-    text = _text_of(path)
-    lines = [(i, line) for i, line in enumerate(text.splitlines(), start=1)]
-    lines = [(i, line) for i, line in lines if line.strip() and not line.startswith("#")]
-    if not lines:
-        raise ValueError("is empty; a table needs a header and rows")
-    mark = ";" if ";" in lines[0][1] else ","
-    header = [name.strip().lower() for name in _split(lines[0], mark)]
-    header = [_NAMES.get(name, name) for name in header]
+    lines, mark, header = opened(path)
     if otherwise and set(otherwise) <= set(header):
         needed = otherwise
     known = {*needed, *optional}
@@ -103,21 +101,33 @@ def read_csv(
         )
     if strange := [name for name in header if name not in known or header.count(name) > 1]:
         raise ValueError(f"line {lines[0][0]}: the column {strange[0][:40]!r} is not known here")
-    if len(lines) > MAX_ROWS + 1:
-        raise ValueError(f"has {len(lines) - 1} rows, at most {MAX_ROWS} are read; thin it out")
+    if len(lines) > most + 1:
+        raise ValueError(f"has {len(lines) - 1} rows, at most {most} are read; thin it out")
     columns: dict[str, list[float]] = {name: [] for name in header}
     for line in lines[1:]:
         fields = _split(line, mark)
         if len(fields) != len(header):
             raise ValueError(f"line {line[0]}: {len(fields)} fields, the header has {len(header)}")
         for name, field in zip(header, fields, strict=True):
-            columns[name].append(_number(field, line[0], name))
+            columns[name].append(number(field, line[0], name))
     if len(lines) == 1:
         raise ValueError("has a header and no rows")
     return columns
 
 
-def _text_of(path: Path) -> str:
+def opened(path: Path) -> tuple[list[tuple[int, str]], str, list[str]]:
+    """Return a table's lines with their numbers, its separator and the names of its columns."""
+    lines = [(i, line) for i, line in enumerate(text_of(path).splitlines(), start=1)]
+    lines = [(i, line) for i, line in lines if line.strip() and not line.startswith("#")]
+    if not lines:
+        raise ValueError("is empty; a table needs a header and rows")
+    mark = ";" if ";" in lines[0][1] else ","
+    names = [name.strip().lower() for name in _split(lines[0], mark)]
+    return lines, mark, [_NAMES.get(name, name) for name in names]
+
+
+def text_of(path: Path) -> str:
+    """Return the text of a regular file of at most 4 MB, or raise ValueError."""
     try:
         about = path.stat()
         if not stat.S_ISREG(about.st_mode):
@@ -126,7 +136,7 @@ def _text_of(path: Path) -> str:
             raise ValueError(f"has {about.st_size} bytes, a table has at most {MAX_BYTES}")
         return path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise ValueError("is not UTF-8 text; save it as CSV in UTF-8") from None
+        raise ValueError("is not UTF-8 text; save it in UTF-8") from None
     except OSError as error:
         raise ValueError(
             f"cannot be read: {error.strerror}; the path is relative to the scenario's folder"
@@ -140,7 +150,8 @@ def _split(line: tuple[int, str], mark: str) -> list[str]:
         raise ValueError(f"line {line[0]}: {error}") from None
 
 
-def _number(field: str, line: int, name: str) -> float:
+def number(field: str, line: int, name: str) -> float:
+    """Return a finite number of a file, or raise ValueError with the line."""
     try:
         value = float(field)
     except ValueError:
@@ -160,6 +171,21 @@ def _places(path: Path) -> dict[str, Any]:
 
 
 def _flight(city: Any, folder: Path, path: Path) -> dict[str, Any]:
+    """Waypoints of a flight, from a log or a table."""
+    log = extension("flight_log")(path)
+    if log is None:
+        return _flight_table(city, folder, path)
+    TAKEN.info(log.note)
+    positions = log.positions
+    if log.in_degrees:
+        positions = _from_degrees(positions, _georeference(city, folder))
+    if log.without_height:
+        positions[:, 2] = 0.0
+    rows = zip(log.times.tolist(), positions.tolist(), strict=True)
+    return {"waypoints": [{"time_s": time, "position_m": position} for time, position in rows]}
+
+
+def _flight_table(city: Any, folder: Path, path: Path) -> dict[str, Any]:
     """Waypoints of a flight in world coordinates, or in those of the city's file: longitude and
     latitude, or a grid's metres from far beyond the world's origin."""
     turned, xyz, degrees = ("yaw_deg", "pitch_deg", "roll_deg"), ("x", "y", "z"), _DEGREES
@@ -223,7 +249,7 @@ def _from_grid(
     return positions if geo is None else geo.to_world(positions)
 
 
-def _by_aspect(unit: str) -> Reader:
+def by_aspect(unit: str) -> Reader:
     """A grid of directions, in any order of rows; `unit`: name of the column of values."""
 
     def read(path: Path) -> dict[str, Any]:
@@ -245,7 +271,8 @@ def _by_aspect(unit: str) -> Reader:
 
 
 def _pattern(path: Path) -> dict[str, Any]:
-    return {"pattern": _by_aspect("dbi")(path)["table"]}
+    found: dict[str, Any] = extension("antenna_pattern")(path)
+    return found
 
 
 def _tables_of(tree: dict[str, Any], folder: Path) -> Iterator[tuple[Key, str, Reader]]:
@@ -256,7 +283,7 @@ def _tables_of(tree: dict[str, Any], folder: Path) -> Iterator[tuple[Key, str, R
     swarm = tree.get("swarm")
     for name in swarm if isinstance(swarm, dict) else ():
         yield ("swarm", name), "flight", partial(_flight, tree.get("city"), folder)
-        yield ("swarm", name, "rcs"), "file", _by_aspect("dbsm")
+        yield ("swarm", name, "rcs"), "file", by_aspect("dbsm")
 
 
 def with_tables(

@@ -1,0 +1,1 @@
+"""Patterns of antennas from the files of other programs."""

@@ -1,0 +1,1 @@
+"""Flights from logs of autopilots, robots and traffic simulations."""

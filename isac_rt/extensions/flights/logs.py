@@ -1,0 +1,170 @@
+"""Flights from logs: PX4's ULog, bags of ROS 2 and floating-car data of SUMO."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isac_rt.runtime import needed, shortly
+from isac_rt.scenario.tables import MAX_WAYPOINTS, number
+
+KEPT_BEFORE_S = 1.0
+"""Part of a log that is kept before the run's start, for the spline's slope there [s]."""
+_LOCAL, _GLOBAL = "vehicle_local_position", "vehicle_global_position"
+_VALID = ("xy_valid", "z_valid", "lat_lon_valid", "alt_valid")
+_FIX, _ODOMETRY = "sensor_msgs/msg/NavSatFix", "nav_msgs/msg/Odometry"
+_TYPES = (_ODOMETRY, "geometry_msgs/msg/PoseStamped", _FIX)
+
+
+@dataclass(frozen=True)
+class FlightLog:
+    """Times (N,) [s] and positions (N, 3) of one UAV or object: east, north, up [m], or latitude,
+    longitude [degrees] and height [m]. `note` says what was taken."""
+
+    note: str
+    times: NDArray[np.float64]
+    positions: NDArray[np.float64]
+    in_degrees: bool
+    without_height: bool = False
+
+
+def flight_log(path: Path) -> FlightLog | None:
+    """Read FILE, FILE#PART or FILE#PART@START, with which the run begins START seconds after the
+    log, or raise ValueError; None: it is no log."""
+    file, part, begin = path, "", 0.0
+    if not os.path.exists(path) and "#" in str(path):
+        head, _, tail = str(path).rpartition("#")
+        part, _, start = tail.partition("@")
+        file, begin = Path(head), number(start, 1, "START") if start else 0.0
+    is_bag = os.path.isfile(file / "metadata.yaml")
+    read = _bag if is_bag else _READERS.get(file.suffix.lower())
+    if read is None or not (is_bag or os.path.isfile(file)):
+        return None
+    try:
+        log = read(file, part)
+    except (ValueError, ImportError):
+        raise
+    except Exception as problem:  # libraries raise all kinds for damaged files
+        raise ValueError(f"is damaged or of another kind: {shortly(problem)}") from problem
+    return _thinned(replace(log, times=log.times - begin), file.name)
+
+
+def _thinned(log: FlightLog, file: str) -> FlightLog:
+    """Return a log of valid positions whose times rise, at most `MAX_WAYPOINTS`."""
+    before = np.maximum.accumulate(np.append(-math.inf, log.times))[:-1]
+    valid = np.isfinite(log.positions).all(axis=1) & (log.times >= -KEPT_BEFORE_S)
+    held = np.flatnonzero((log.times > before) & valid)
+    if held.size < 2:
+        raise ValueError(f"{log.note}: {held.size} valid positions from the start on, 2 are needed")
+    step = math.ceil(held.size / MAX_WAYPOINTS)
+    note = f"{file}: {log.note}, {held.size} positions, {np.ptp(log.times[held]):.1f} s"
+    note += f", one of {step} is taken" if step > 1 else ""
+    held = held[::step]
+    return replace(log, note=note, times=log.times[held], positions=log.positions[held])
+
+
+def _choose(part: str, parts: Sequence[str], kind: str) -> str:
+    """Return the part of a log that is asked for, or its only one."""
+    if part in parts or (not part and len(parts) == 1):
+        return part or parts[0]
+    named = ", ".join(sorted(parts))[:200]
+    raise ValueError(
+        f"name a {kind} as FILE#NAME; there are {len(parts)}{': ' * bool(parts)}{named}"
+    )
+
+
+def _ulog(file: Path, part: str) -> FlightLog:
+    """Read the positions of a ULog: local ones are north, east and down from where the autopilot
+    began."""
+    log = needed("pyulog", "flights").ULog(str(file), [_LOCAL, _GLOBAL])
+    data: dict[str, Mapping[str, Any]] = {d.name: d.data for d in log.data_list if d.multi_id == 0}
+    name = _choose(part, list(data), "message with positions")
+    c = data[name]
+    valid = np.all([c[flag] > 0 for flag in _VALID if flag in c] or [[True]], axis=0)
+    stamp = c["timestamp_sample" if "timestamp_sample" in c else "timestamp"].astype(np.int64)
+    keys = ("lat", "lon", "alt") if name == _GLOBAL else ("y", "x", "z")
+    positions = np.column_stack([c[key].astype(float) for key in keys])
+    positions[:, 2] *= 1 if name == _GLOBAL else -1
+    positions[~np.broadcast_to(valid, stamp.shape)] = np.nan
+    return FlightLog(name, (stamp - stamp[0]) * 1e-6, positions, name == _GLOBAL)
+
+
+def _bag(file: Path, part: str) -> FlightLog:
+    """Read a topic of a bag of ROS 2. Times are those of the headers, from the first of all topics
+    with positions; axes are east, north and up (REP 103)."""
+    needed("rosbags", "flights")
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)  # types that a bag defines would become code
+    stamps, positions, first = [], [], math.inf
+    with Reader(file) as bag:
+        placed = [c for c in bag.connections if c.msgtype in _TYPES]
+        kinds = {c.topic: c.msgtype for c in placed}
+        topic = _choose(part, list(kinds), "topic of Odometry, PoseStamped or NavSatFix")
+        for connection, _, raw in bag.messages(connections=placed):
+            message: Any = store.deserialize_cdr(raw, connection.msgtype)
+            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            first = min(first, stamp)
+            if connection.topic != topic:
+                continue
+            stamps.append(stamp)
+            if connection.msgtype == _FIX:
+                valid = 1.0 if message.status.status >= 0 else math.nan
+                p = message.latitude * valid, message.longitude, message.altitude
+            else:
+                pose = message.pose.pose if connection.msgtype == _ODOMETRY else message.pose
+                p = pose.position.x, pose.position.y, pose.position.z
+            positions.append(p)
+    times = np.array([stamp - first for stamp in stamps]) * 1e-9
+    return FlightLog(topic, times, np.reshape(positions, (-1, 3)), kinds[topic] == _FIX)
+
+
+def _sumo(file: Path, part: str) -> FlightLog:
+    """Read a vehicle or person of floating-car data: x, y [m] of the net, or longitude and latitude
+    where the file's first comment tells of --fcd-output.geo; times from the file's first step. A
+    document type is refused: its entities might grow without end."""
+    parser = expat.ParserCreate()
+    names: set[str] = set()
+    steps: list[float] = []
+    rows: list[tuple[float, ...]] = []
+    on_earth: list[bool] = []
+
+    def doctype(*_: Any) -> None:
+        raise ValueError(f"line {parser.CurrentLineNumber}: a <!DOCTYPE> is not read; remove it")
+
+    def start(tag: str, of: Mapping[str, str]) -> None:
+        def value(key: str) -> float:
+            return number(of.get(key, ""), parser.CurrentLineNumber, key)
+
+        if tag == "timestep":
+            steps.append(value("time"))
+        elif tag in ("vehicle", "person") and steps:
+            names.add(of.get("id", ""))
+            if part in ("", of.get("id")):
+                z = value("z") if "z" in of else math.nan
+                rows.append((steps[-1] - steps[0], value("x"), value("y"), z))
+
+    parser.StartDoctypeDeclHandler = doctype
+    parser.StartElementHandler = start
+    parser.CommentHandler = lambda text: on_earth.append('fcd-output.geo value="true"' in text)
+    try:
+        with file.open("rb") as opened:
+            parser.ParseFile(opened)
+    except expat.ExpatError as problem:
+        raise ValueError(f"{problem}; run SUMO again") from None
+    name = _choose(part, list(names), "vehicle")
+    c = np.array(rows)
+    positions = np.nan_to_num(c[:, [2, 1, 3] if any(on_earth) else [1, 2, 3]])
+    return FlightLog(name, c[:, 0], positions, any(on_earth), bool(np.isnan(c[:, 3]).any()))
+
+
+_READERS = {".ulg": _ulog, ".xml": _sumo, ".db3": _bag, ".mcap": _bag, ".bag": _bag}
