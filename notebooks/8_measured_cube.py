@@ -65,7 +65,7 @@ capture.cube
 found = irt.calibrate(capture)
 print(f"reflector at {found.range_m:.4f} m, {found.snr_db:.0f} dB over the median cell")
 print(f"rank-one share {found.rank_one_share:.4f}")
-print(f"left of it {found.left_db:.2f} dB and {found.left_deg:.2f} degrees")
+print(f"left of it {found.residual_db:.2f} dB and {found.residual_deg:.2f} degrees")
 print(f"gains scatter by {found.gain_spread_rx_db:.2f} (RX), {found.gain_spread_tx_db:.2f} dB (TX)")
 
 # %% [markdown]

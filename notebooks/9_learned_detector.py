@@ -82,7 +82,7 @@ splits = {
 def in_view(sample):
     """UAVs that the radar could see."""
     uavs = sample["truth"]["uavs"].items()
-    return [u for name, u in uavs if name != "radar" and u["in_view"] and not u["shadowed"]]
+    return [u for name, u in uavs if name != "radar" and u["in_view"] and not u["occluded"]]
 
 
 sample = max(splits["test"], key=lambda s: len(in_view(s)))

@@ -170,7 +170,7 @@ def _terminals(found: Mapping[str, Outcomes]) -> Iterator[dict[str, Any]]:
             **{key: mean([b[key] for b in bounds]).value for key in bounds[0]},
             **_spread("false_tracks_per_frame", _false(blocks)),
             **_spread("gospa_m", _gospa(blocks)),
-            "empty_m": root([b["gospa"]["empty_m"] for b in blocks]).value,
+            "no_tracks_m": root([b["gospa"]["no_tracks_m"] for b in blocks]).value,
             **_spread("ser_delay", _counted(blocks, "ser_delay")),
             **_spread("ser_dpsk", _counted(blocks, "ser_dpsk")),
             **_spread("erased", mean([b["erased"] for b in blocks])),
@@ -254,7 +254,7 @@ def _picture(blocks: Outcomes) -> dict[str, float]:
         **_spread("tracked_rate", share("tracked")),
         **_spread("false_tracks_per_frame", _false(blocks)),
         **_spread("gospa_m", root([b["gospa"]["total_m"] for b in blocks])),
-        "empty_m": root([b["gospa"]["empty_m"] for b in blocks]).value,
+        "no_tracks_m": root([b["gospa"]["no_tracks_m"] for b in blocks]).value,
         "position_m": root([b["rmse"]["position_m"] for b in blocks]).value,
         "nees": mean([b["nees"] for b in blocks]).value,
         "switches": sum(t["switches"] for one in parts for t in one),
@@ -422,7 +422,7 @@ def _figure(terminals: pd.DataFrame) -> Figure:
         own = terminals[terminals.receivers == SETS[0]]
         places = [seats.index(s) for s in zip(own.place, own.terminal, strict=True)]
         axes[0, 0].plot(places, own.genie, "k_", label="matched filter")
-        axes[2, 0].plot(places, own.empty_m, "k_", label="empty picture")
+        axes[2, 0].plot(places, own.no_tracks_m, "k_", label="no tracks")
         axes[1, 0].set_yscale("symlog", linthresh=0.1)
         for ax in axes[:, 0]:
             ax.legend(loc="best")

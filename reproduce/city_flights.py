@@ -183,7 +183,7 @@ def by_frame(results: Results) -> dict[str, list[list[int]]]:
     for i, (tx, rx) in enumerate(zip(d.transmitter.values, d.receiver.values, strict=True)):
         one = d.isel(observer=i)
         u = uavs.index(str(tx))
-        sight = one.in_view.values[:, u] & ~one.shadowed.values[:, u]
+        sight = one.in_view.values[:, u] & ~one.occluded.values[:, u]
         wrong, sent = one.symbol_errors.values, one.symbol_total.values
         counts = [wrong[:, 0], sent[:, 0], wrong[:, 1], sent[:, 1]]
         table = [d.frame.values, sight, *counts, one.latency_frames.values >= 0]

@@ -74,7 +74,7 @@ def _of_bound(block: Block) -> float:
 
 
 def _of_empty(block: Block) -> float:
-    return _ratio(block["gospa"]["total_m"], block["gospa"]["empty_m"])
+    return _ratio(block["gospa"]["total_m"], block["gospa"]["no_tracks_m"])
 
 
 def _at(role: str, value: Callable[[Block], float]) -> Callable[[Block], Values]:

@@ -192,7 +192,7 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
                         }
                     ),
                     in_view=np.array([name == "PT1", False, True]),
-                    shadowed=hidden,
+                    occluded=hidden,
                     hit=see & (f != 5),
                     loss=np.where(see, Loss.INACCURATE if f == 5 else Loss.FOUND, -1),
                     target_snr=np.where(see, 317.0, np.nan),

@@ -737,8 +737,8 @@ OF_TESTS = (
         Bug("results/scoring.py", "get(track, [-1, -1, -1])", "get(track, [0, 0, 0])"),
     ),
     (
-        "test_dataset::test_the_truth_of_a_sample_tells_who_is_shadowed",
-        Bug("sweep/shards.py", 'd["shadowed"][f, o, u]', 'd["in_view"][f, o, u]'),
+        "test_dataset::test_the_truth_of_a_sample_tells_who_is_occluded",
+        Bug("sweep/shards.py", 'd["occluded"][f, o, u]', 'd["in_view"][f, o, u]'),
     ),
     (
         "test_import::test_numbers_that_lost_their_sign_get_it_back",

@@ -244,7 +244,7 @@ MAX_LINES = {
     "receive": 6065,
     "track": 1901,
     "scenario": 1820,
-    "results": 3650,
+    "results": 3686,
     "simulation": 3430,
     "sweep": 2790,
     "views": 3500,

@@ -41,8 +41,8 @@ CalibrationFile = Annotated[
     typer.Option("--calibration", metavar="CAL", help="Calibration of the board to apply."),
 ]
 KEYS = (
-    "range_m range_scatter_mm rank_one_share left_db left_deg gain_spread_rx_db gain_spread_tx_db "
-    "unexplained_db unexplained_response_db range_bound_mm snr_db"
+    "range_m range_scatter_mm rank_one_share residual_db residual_deg gain_spread_rx_db "
+    "gain_spread_tx_db unexplained_db unexplained_response_db range_bound_mm snr_db"
 ).split()
 STDOUT = "-"
 

@@ -121,7 +121,7 @@ class FreeSpace:
         return float(radar_amplitude(self.wavelength, section, there.length, back.length)[0])
 
     def reference_amplitude(self, poses: dict[str, Pose], link: Link) -> float:
-        """Amplitude of a link's reference path as if unshadowed and on boresight at both ends.
+        """Amplitude of a link's reference path as if unoccluded and on boresight at both ends.
 
         The line of sight of a link between two terminals; for a terminal's own echoes the strongest
         by the radar equation among the UAVs whose cross-section is not itself relative.

@@ -110,12 +110,12 @@ OBSERVERS: dict[str, Column] = {
         for name, (units, _) in MEASURES.items()
     },
     "in_view": _of_uavs("UAV inside the field of view", "in_view", bool, 0),
-    "shadowed": _of_uavs("UAV occluded by the city", "shadowed", bool, 0),
+    "occluded": _of_uavs("UAV occluded by the city", "occluded", bool, 0),
     "hit": _of_uavs(
         "UAV found by its own path within one resolution on all four axes", "hit", bool, 0
     ),
     "loss": _of_uavs(
-        "what became of a UAV in view and unshadowed, -1: not one", "loss", np.int8, -1
+        "what became of a UAV in view and unoccluded, -1: not one", "loss", np.int8, -1
     ),
     "target_snr": _of_uavs(
         "SNR of the UAV's own path behind a matched filter over samples, chirps and antennas",
@@ -327,7 +327,7 @@ def _of_fused(name: str, column: int) -> Callable[[FusedRecord], np.ndarray]:
     return lambda p: getattr(p, name)[:, column]
 
 
-PICTURES: dict[str, Column] = {
+FUSED_SETS: dict[str, Column] = {
     "gospa": Column(
         float,
         "m2",
@@ -358,7 +358,9 @@ PICTURES: dict[str, Column] = {
         "earlier messages, lost until then, that came with a frame read late", "late", np.int32
     ),
     "bits": _number("bits of these messages", "bits", np.int64),
-    "room": _number("capacity of the links to the terminal for messages in bits", "room", np.int64),
+    "capacity": _number(
+        "capacity of the links to the terminal for messages in bits", "capacity", np.int64
+    ),
     "left_out": _number(
         "tracks or detections that the messages had no room for", "left_out", np.int32
     ),
@@ -450,7 +452,7 @@ TABLES: dict[str, dict[str, Column]] = {
     "det": DETECTIONS,
     "track": TRACKS,
     "use": USES,
-    "picture": PICTURES,
+    "fused_set": FUSED_SETS,
     "fused": FUSED,
 }
 """What is kept of every frame: in the dataset and beside it."""

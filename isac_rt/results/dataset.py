@@ -18,12 +18,12 @@ from isac_rt.results.columns import (
     DIMENSIONLESS,
     ERRORS,
     FRAMES,
+    FUSED_SETS,
     MAPS,
     MEASURES,
     OBSERVERS,
     PARTS,
     PATHS,
-    PICTURES,
     SIZES,
     SYMBOLS,
     TABLES,
@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 
 Row = dict[str, dict[str, Any]]
 """A frame: of each of `TABLES`, and of a snapshot's ``path`` and ``maps``, what each observer or
-picture has."""
+owner has."""
 Tables = Mapping[str, Mapping[str, Table]]
-"""The frames so far: of each of `TABLES`, what each observer or picture has."""
+"""The frames so far: of each of `TABLES`, what each observer or owner has."""
 Columns = Mapping[str, np.ndarray] | np.ndarray
 """Rows of a table: arrays by name, or an array with named fields."""
 
@@ -64,14 +64,14 @@ def tracked_states(dataset: xr.Dataset) -> np.ndarray:
     return np.asarray(dataset.track_state.values + np.concatenate(of, axis=1))
 
 
-def fused_positions(dataset: xr.Dataset, frame: int, picture: str) -> np.ndarray:
+def fused_positions(dataset: xr.Dataset, frame: int, owner: str) -> np.ndarray:
     """(B, 3) where the set of fused tracks of a terminal, or of the swarm, has UAVs that are no
     terminals [m]; none where terminals do not cooperate."""
-    if "picture" not in dataset.variables:
+    if "owner" not in dataset.variables:
         return np.zeros((0, 3))
     mine = (
         (dataset.fused_frame.values == frame)
-        & (dataset.fused_picture.values == list(dataset.picture.values).index(picture))
+        & (dataset.fused_owner.values == list(dataset.owner.values).index(owner))
         & (dataset.fused_terminal.values < 0)
     )
     return np.column_stack([dataset[f"fused_{axis}"].values[mine] for axis in "xyz"])
@@ -125,7 +125,7 @@ def row_of(record: FrameRecord) -> Row:
         "frame": rows("frame", {"": record}),
         **{kind: rows(kind, record.observers) for kind in ("observer", "det", "track")},
         "use": rows("use", record.uses),
-        **{kind: rows(kind, record.fused_records) for kind in ("picture", "fused")},
+        **{kind: rows(kind, record.fused_records) for kind in ("fused_set", "fused")},
     }
     for label, o in record.observers.items() if record.snapshot else ():
         lookup = np.array([uavs.index(name) for name in o.paths.target_names] + [-1])
@@ -272,18 +272,18 @@ def _put_paths(put: Callable[..., None], found: Sequence[tuple[int, int, Columns
 
 def _put_fused(put: Callable[..., None], tables: Tables, sizes: Mapping[str, int]) -> None:
     """The set of fused tracks of terminals that cooperate; nothing where none does."""
-    names = list(tables["picture"])
+    names = list(tables["fused_set"])
     if not names:
         return
     for name, words, meaning in (
-        ("picture", names, "terminal whose fused tracks they are, or the whole swarm"),
+        ("owner", names, "terminal whose fused tracks they are, or the whole swarm"),
         ("part", PARTS, "part of the GOSPA distance"),
         ("measure", ERRORS, "measure of an error"),
     ):
         put(name, [name], np.array(list(words), object), DIMENSIONLESS, meaning)
-    of = list(tables["picture"].values())
-    _put_dense(put, "picture", PICTURES, of, sizes, "picture_")
-    _put_ragged(put, "fused", "fused", "picture", list(tables["fused"].values()))
+    of = list(tables["fused_set"].values())
+    _put_dense(put, "owner", FUSED_SETS, of, sizes, "fused_")
+    _put_ragged(put, "fused", "fused", "owner", list(tables["fused"].values()))
 
 
 def _put_maps(

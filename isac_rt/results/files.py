@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel
 
+from isac_rt.results.losses import LOSSES
 from isac_rt.results.recorder import Results
 from isac_rt.runtime import UserError, available_memory, shortly
 from isac_rt.scenario.file import to_yaml
@@ -44,6 +45,21 @@ COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True, "f
 HDF5_FORMAT = ("v110", "v110")
 """Format of HDF5 1.10, of 2016: its metadata have checksums, so that a flipped byte cannot make one
 variable's numbers another's."""
+
+
+RENAMED = {
+    "shadowed": "occluded",
+    "hidden": "occluded",
+    "not_read": "erased",
+    "empty_m": "no_tracks_m",
+    "bits_room": "bits_capacity",
+    "unheard_per_frame": "filtered_per_frame",
+    "judged": "tested",
+    "picture": "owner",
+    "picture_room": "fused_capacity",
+    "fused_picture": "fused_owner",
+}
+"""New names of variables and of figures of earlier versions."""
 
 
 class ResultsError(UserError):
@@ -151,6 +167,26 @@ def save(results: Results, folder: str | Path) -> None:
     )
 
 
+def with_new_names(tree: Any) -> Any:
+    """Replace keys of earlier versions in a summary or a sample's truth."""
+    if not isinstance(tree, dict):
+        return tree
+    return {
+        key if isinstance(value, dict) else RENAMED.get(key, key): with_new_names(value)
+        for key, value in tree.items()
+    }
+
+
+def new_variables(dataset: xr.Dataset) -> xr.Dataset:
+    """Replace names of earlier versions in a dataset."""
+    old = [str(name) for name in dataset.variables]
+    new = {name: RENAMED.get(name, name.replace("picture_", "fused_")) for name in old}
+    dataset = dataset.rename({name: to for name, to in new.items() if to != name})
+    if "loss" in dataset:
+        dataset.loss.attrs["flag_meanings"] = " ".join(LOSSES)
+    return dataset
+
+
 def check_folder(folder: str | Path) -> None:
     """Refuse a folder that cannot be made or written, or has little room, before a long run rather
     than after it.
@@ -181,8 +217,8 @@ def open_results(folder: str | Path) -> Results:
 
     folder = Path(folder)
     try:
-        dataset = read_dataset(folder / FILE)
-        summary = json.loads(read_whole(folder / "summary.json", MOST_JSON_BYTES))
+        dataset = new_variables(read_dataset(folder / FILE))
+        summary = with_new_names(json.loads(read_whole(folder / "summary.json", MOST_JSON_BYTES)))
         _Summary.model_validate(summary)
     except (OSError, MemoryError, *BAD_DATA) as problem:
         raise ResultsError(

@@ -39,7 +39,7 @@ class Loss(IntEnum):
 
     FOUND = 0  # by its own path, within one resolution on all four axes
     TOO_WEAK = 1  # for a matched filter that is coherent over samples, chirps and antennas
-    NOT_READ = 2  # a PT did not read the data, or misread them, and had nothing clean to look at
+    ERASED = 2  # a PT did not read the data, or misread them, and had nothing clean to look at
     INACCURATE = 3  # detected by its own path, but farther off than one resolution
     NOISE = 4  # to a detector that adds the channels' powers
     MASKED = 5  # by a stronger line of sight, mirror image, leakage, or another UAV's echo
@@ -337,7 +337,7 @@ def cause_of(
     causes = {
         Loss.FOUND: hit,
         Loss.TOO_WEAK: chance.matched < 10 ** (MATCHED_DB / 10),
-        Loss.NOT_READ: not read,
+        Loss.ERASED: not read,
         Loss.INACCURATE: own,
         Loss.NOISE: likely < HOPELESS,
         Loss.MASKED: chance.masked or bool(((beside >= 0) & (beside != PathKind.DIFFUSE)).any()),

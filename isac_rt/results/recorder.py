@@ -184,9 +184,9 @@ class Recorder:
             },
             "access": figures.access,
             "sparsity": {
-                str(link): judged
+                str(link): tested
                 for link in self.timetable.all_links
-                if (judged := self._sparsity(link))
+                if (tested := self._sparsity(link))
             }
             or None,
             "versions": versions_in_use(),
@@ -229,7 +229,7 @@ class Recorder:
         }
         fused_records = {
             name: (table.whole(), self.tables["fused"][name].whole())
-            for name, table in self.tables["picture"].items()
+            for name, table in self.tables["fused_set"].items()
         }
         swarm = summary_of(fused_records, list(timetable.first_roles))
         return {"terminals": terminals, "links": links, "swarm": swarm}
@@ -248,11 +248,11 @@ class Recorder:
         """Frames whose receiver judged how sparse the scene is, those found dense, and those sent
         by the conventional schedule for that reason; None where no frame was judged."""
         rows = self._of(link)
-        judged = rows["sparse"][rows["sparse"] >= 0]
-        if not len(judged):
+        tested = rows["sparse"][rows["sparse"] >= 0]
+        if not len(tested):
             return None
-        dense, fell_back = int((judged == 0).sum()), int(rows["fell_back"].sum())
-        return {"judged": len(judged), "dense": dense, "fell_back": fell_back}
+        dense, fell_back = int((tested == 0).sum()), int(rows["fell_back"].sum())
+        return {"tested": len(tested), "dense": dense, "fell_back": fell_back}
 
 
 def _symbols(link: Link, by_link: np.ndarray) -> SymbolCount | None:
@@ -278,7 +278,7 @@ def kept_of_paths(use: Columns) -> dict[str, Any]:
         "frames": len(kept),
         **{
             f"{name}_per_frame": mean(use[name])
-            for name in ("found", "unheard", "weak", "plane", "straight")
+            for name in ("found", "filtered", "weak", "plane", "straight")
         },
         "kept_per_frame": {KINDS[k]: mean(kept[:, k]) for k in order if kept[:, k].any()},
         "bounces": int(use["bounces"].max()),

@@ -71,13 +71,13 @@ class UavScores:
     ----------
     truth, detected, tracked : over all UAVs; estimates are NaN where none is associated
     bound : least standard deviations of an estimate (Cramer-Rao), NaN where the UAV is not in view
-        or shadowed
-    in_view, shadowed : (U,) bool; whether it is in the field of view; whether the city hides it
-    hit : (U,) bool; whether it is in view, unshadowed and found by its own path, within one
+        or occluded
+    in_view, occluded : (U,) bool; whether it is in the field of view; whether the city hides it
+    hit : (U,) bool; whether it is in view, unoccluded and found by its own path, within one
         resolution on all four axes
-    loss : (U,) `isac_rt.results.losses.Loss` where it is in view and unshadowed, else -1
+    loss : (U,) `isac_rt.results.losses.Loss` where it is in view and unoccluded, else -1
     target_snr : (U,) SNR of its own path behind a matched filter that is coherent over the whole
-        frame (linear), NaN where it is not in view or shadowed
+        frame (linear), NaN where it is not in view or occluded
     target_cell_snr, target_straddling, target_whitened_snr : (U,) its SNR in its cell of the
         Hann-windowed map with all channels in phase (linear), the share of it that lying between
         cells leaves, and the SNR after whitening by the true clutter, likewise
@@ -85,7 +85,7 @@ class UavScores:
     cooperative : (U,) bool; terminals, which report their position; none in a swarm of terminals
         alone, whose terminals are its targets
     genie : (U,) probability that a matched filter at the true parameters finds its own path, NaN
-        where it is not in view or shadowed
+        where it is not in view or occluded
     clutter_free : (U,) probability that the receiver's detector would find it in noise alone,
         likewise
     whitened : (U,) probability that a detector finds it that whitens the channels of its cell by
@@ -97,7 +97,7 @@ class UavScores:
     tracked: UavValues
     bound: UavValues
     in_view: np.ndarray
-    shadowed: np.ndarray
+    occluded: np.ndarray
     hit: np.ndarray
     loss: np.ndarray
     target_snr: np.ndarray
@@ -137,7 +137,7 @@ class ObserverRecord:
     uavs : what it found of each UAV
     tracks : after this frame
     state : code of the terminal's state, an index into the recorder's `states`
-    gospa : of the confirmed tracks against the targets in view and unshadowed
+    gospa : of the confirmed tracks against the targets in view and unoccluded
     symbols : what was sent to it and became of it
     latency : frames after which its data were read, -1: they were erased
     slips : symbols decided outside their alphabet
@@ -197,7 +197,7 @@ class FusedRecord:
     reports, age : what was received from others and counts, and its mean age [s]
     messages, lost : that reached the terminal in this frame, and those of them that were lost
     late : earlier ones, lost until then, that came with a frame that was read late
-    bits, room : of these messages, and that the ways to the terminal had in this frame
+    bits, capacity : of these messages, and of the links to the terminal in this frame
     left_out : tracks or detections that these messages had no room for
     origin, number : (B,) name: index of the link and number of its track
     mean, std : (B, 6) position and velocity in world axes [m, m/s]
@@ -218,7 +218,7 @@ class FusedRecord:
     lost: int
     late: int
     bits: int
-    room: int
+    capacity: int
     left_out: int
     origin: np.ndarray
     number: np.ndarray
@@ -235,7 +235,7 @@ class Use:
 
     Attributes
     ----------
-    found, unheard, weak : number of paths found, stopped by the IF filter and left out as too weak
+    found, filtered, weak : number of paths found, stopped by the IF filter and left out as too weak
     kept : by kind
     bounces : most bounces of a kept path
     left_out : largest power left out of one range cell over the noise of a cell (linear)
@@ -246,7 +246,7 @@ class Use:
     """
 
     found: int
-    unheard: int
+    filtered: int
     weak: int
     kept: dict[str, int]
     bounces: int

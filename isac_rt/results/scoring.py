@@ -169,7 +169,7 @@ class Scorer(Stateful):
             tracked=_estimates(count, received.tracks.measured, caused, observed),
             bound=self._bound(view, chances),
             in_view=view.inside,
-            shadowed=view.inside & ~view.direct,
+            occluded=view.inside & ~view.direct,
             hit=hit,
             loss=loss,
             target_snr=by_uav(lambda c: c.matched),
@@ -359,7 +359,7 @@ class _View:
     inside : (U,) in the field of view
     direct : (U,) reached straight, without the city
     straight : (K,) index of the UAV whose own straight path each path is, -1: none's
-    seen : the truth of those in view and unshadowed, by index
+    seen : the truth of those in view and unoccluded, by index
     positions : (U, 3) relative to the receiver [m]
     directions : (K, 2) u_x, u_z from which each path arrives
     """

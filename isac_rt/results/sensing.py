@@ -35,8 +35,8 @@ class Sensing:
 
     Attributes
     ----------
-    seen : (F, U) bool, in view and unshadowed; all that follows is of these only
-    hidden : (F, U) bool, in view but shadowed
+    seen : (F, U) bool, in view and unoccluded; all that follows is of these only
+    occluded : (F, U) bool, in the field of view but occluded
     hit : (F, U) bool
     detected, tracked : (F, U, 4) errors [m, m/s, deg, deg], NaN where there is no estimate
     followed : (F, U) bool, a confirmed track is within three resolutions
@@ -54,7 +54,7 @@ class Sensing:
     """
 
     seen: np.ndarray
-    hidden: np.ndarray
+    occluded: np.ndarray
     hit: np.ndarray
     detected: np.ndarray
     tracked: np.ndarray
@@ -81,7 +81,7 @@ class Sensing:
         values : (F,) of the observer
         tracks, frame : (K,) its tracks, and the frame of each
         """
-        in_view, shadowed = np.array(values["in_view"]), np.array(values["shadowed"])
+        in_view, occluded = np.array(values["in_view"]), np.array(values["occluded"])
         count, num_uavs = in_view.shape
 
         def errors(group: str) -> np.ndarray:
@@ -104,15 +104,15 @@ class Sensing:
         kind, ghost_of = tracks["kind"], tracks["target"]
         ghost = false & (kind == PathKind.GHOST) & (ghost_of >= 0)
         return cls(
-            in_view & ~shadowed,
-            shadowed,
+            in_view & ~occluded,
+            occluded,
             np.array(values["hit"]),
             errors("detected"),
             errors("tracked"),
             counted(tracks["uav"], tracks["uav"] >= 0, num_uavs) > 0,
             errors("bound"),
             np.array(values["loss"]),
-            *_breaks(tracks, frame, in_view & ~shadowed),
+            *_breaks(tracks, frame, in_view & ~occluded),
             np.array(values["cooperative"]),
             np.stack([values[name] for name in BOUNDS], axis=-1),
             _levels(values),
@@ -159,7 +159,7 @@ class Sensing:
         least = np.where(np.isfinite(errors), least, np.nan)
         return {
             "in_view": int(self.seen[:, i].sum()),
-            "hidden": int(self.hidden[:, i].sum()),
+            "occluded": int(self.occluded[:, i].sum()),
             "found": int(self.hit[:, i].sum()),
             "detected": int(np.isfinite(errors[:, 0]).sum()),
             "tracked": int((self.followed & self.seen)[:, i].sum()),
@@ -228,7 +228,7 @@ def gospa_block(parts: np.ndarray, seen: np.ndarray) -> dict[str, float | None]:
     seen : (F, U) bool, what ought to be in the set of fused tracks
     """
     if not len(parts):
-        return dict.fromkeys(("total_m", "missed", "false", "localisation_m", "empty_m"))
+        return dict.fromkeys(("total_m", "missed", "false", "localisation_m", "no_tracks_m"))
     localisation, missed, false = np.mean(parts, axis=0)
     each = GOSPA_CUTOFF_M**2 / 2
     return {
@@ -236,7 +236,7 @@ def gospa_block(parts: np.ndarray, seen: np.ndarray) -> dict[str, float | None]:
         "missed": float(missed / each),
         "false": float(false / each),
         "localisation_m": float(np.sqrt(localisation)),
-        "empty_m": float(np.sqrt(each * seen.sum(axis=1).mean())),
+        "no_tracks_m": float(np.sqrt(each * seen.sum(axis=1).mean())),
     }
 
 

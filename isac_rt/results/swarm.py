@@ -44,7 +44,7 @@ class Traffic:
     ----------
     messages, lost : how many, and how many of them were lost
     late : how many earlier ones, lost until then, came with a frame that was read late
-    bits, room : of these messages, and that the ways to the terminal had in the frame
+    bits, capacity : of these messages, and of the links to the terminal in the frame
     left_out : tracks or detections that they had no room for
     """
 
@@ -52,7 +52,7 @@ class Traffic:
     lost: int = 0
     late: int = 0
     bits: int = 0
-    room: int = 0
+    capacity: int = 0
     left_out: int = 0
 
     def __add__(self, other: Traffic) -> Traffic:
@@ -111,12 +111,12 @@ class SwarmScorer(Stateful):
         ----------
         views : by name
         observers : the frame's records, by link
-        poses : of all UAVs at the time of each picture, by its name
+        poses : of all UAVs at the time of each set of fused tracks, by its name
         """
         timetable, state = self._timetable, self.state
         for link, o in observers.items():
             u = o.uavs
-            state.seen[link], state.found[link] = u.in_view & ~u.shadowed, u.hit
+            state.seen[link], state.found[link] = u.in_view & ~u.occluded, u.hit
         now = [link for link in state.seen if timetable.holds(link, frame)]
         target = np.array([role == "target" for role in timetable.roles(frame).values()])
         seen = {link: state.seen[link] & target for link in now}
@@ -240,7 +240,7 @@ def _block(frames: Columns, tracks: Columns, names: Sequence[str]) -> dict[str, 
         "messages_lost": total("lost") - total("late"),
         "messages_late": total("late"),
         "bits": total("bits"),
-        "bits_room": total("room"),
+        "bits_capacity": total("capacity"),
         "left_out": total("left_out"),
         "targets": {
             name: {

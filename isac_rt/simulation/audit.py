@@ -275,16 +275,16 @@ def _link_items(setup: Setup, link: Link, uses: list[Use]) -> list[Item]:
     name, share = str(link), setup.plan.phase_share
     mean = {
         key: float(np.mean([getattr(use, key) for use in uses]))
-        for key in ("found", "unheard", "weak", "plane", "straight")
+        for key in ("found", "filtered", "weak", "plane", "straight")
     }
     kinds = dict.fromkeys(kind for use in uses for kind in use.kept)
     kept = ", ".join(
         f"{np.mean([use.kept.get(k, 0) for use in uses]):,.0f} {k.replace('_', ' ')}" for k in kinds
     )
     said = f"{kept or 'none'}; bounces: {max(use.bounces for use in uses)} at most"
-    gone = f"{mean['weak']:,.0f} too weak, {mean['unheard']:,.0f} out of reach"
+    gone = f"{mean['weak']:,.0f} too weak, {mean['filtered']:,.0f} out of reach"
     left = decibels(min(POWER_MARGIN * max(use.left_out for use in uses), setup.plan.weakest))
-    num_kept = max(mean["found"] - mean["unheard"] - mean["weak"], 1.0)
+    num_kept = max(mean["found"] - mean["filtered"] - mean["weak"], 1.0)
 
     def phase(errors: Iterable[float]) -> float:
         return float(min(PHASE_MARGIN * max(errors), share))

@@ -217,7 +217,7 @@ class Plan:
         plane, straight = plane_error <= self.phase_share, straight_error <= self.phase_share
         use = Use(
             found=len(paths),
-            unheard=int((~received).sum()),
+            filtered=int((~received).sum()),
             weak=int(weak.sum()),
             kept={name: count for name, count in kept.counts().items() if count},
             bounces=int(kept.bounces.max(initial=0)),

@@ -202,7 +202,7 @@ class Setup:
     """The city in the terminals' maps, with the errors of `belief`."""
     propagation: Propagation
     reference: FreeSpace
-    """Closed forms of the reference paths, as they would be unshadowed and in view."""
+    """Closed forms of the reference paths, as they would be unoccluded and in view."""
     timetable: Timetable
     connections: Connections
     plan: Plan

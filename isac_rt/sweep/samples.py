@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
-from isac_rt.results.files import ResultsError
+from isac_rt.results.files import ResultsError, with_new_names
 from isac_rt.runtime import shortly
 from isac_rt.storage import BAD_DATA, MOST_JSON_BYTES, read_whole
 from isac_rt.sweep.drawn import Kept
@@ -225,7 +225,7 @@ def read_sample(
                 if len(content) < size:
                     raise EOFError(f"{ending} ends early")
                 if ending == "json":
-                    out["truth"] = _numbers(json.loads(content))
+                    out["truth"] = _numbers(with_new_names(json.loads(content)))
                     continue
                 out[name] = np.load(io.BytesIO(content), allow_pickle=False)
                 if not isinstance(out[name], np.ndarray):

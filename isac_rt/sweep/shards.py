@@ -63,7 +63,7 @@ def _truth(d: Mapping[str, np.ndarray], f: int, o: int) -> dict[str, Any]:
             "position_m": d["uav_position"][f, u].tolist(),
             "velocity_mps": d["uav_velocity"][f, u].tolist(),
             "in_view": bool(d["in_view"][f, o, u]),
-            "shadowed": bool(d["shadowed"][f, o, u]),
+            "occluded": bool(d["occluded"][f, o, u]),
             **{key: _finite(d[f"truth_{key}"][f, o, u]) for key in TRUTH},
         }
         for u, name in enumerate(d["uav"])

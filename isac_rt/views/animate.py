@@ -105,7 +105,7 @@ class _Moving:
             str(dataset.receiver.values[observer]): ("s", 10, "fused tracks"),
             SWARM: ("D", 14, "fused tracks, swarm"),
         }
-        alone = "" if "picture" in dataset.variables else "_"
+        alone = "" if "owner" in dataset.variables else "_"
         self._fused = {
             name: ax.plot([], [], mark, color="black", ms=size, mfc="none", label=alone + words)[0]
             for name, (mark, size, words) in fused.items()

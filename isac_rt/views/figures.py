@@ -145,7 +145,7 @@ def _footprints(ax: Axes, city: CityMesh, low: np.ndarray, high: np.ndarray) -> 
 
 
 def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
-    """Truth (line), raw detections (dots) and tracks (thick) of every UAV over time; shadowed
+    """Truth (line), raw detections (dots) and tracks (thick) of every UAV over time; occluded
     intervals shaded in its colour."""
     scale, unit = _UNITS[name]
     here = _processed(dataset, observer)
@@ -163,13 +163,13 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
         )
         ax.plot(t, here(f"detected_{name}")[:, u] * scale, ".", color=colour, ms=4, alpha=0.7)
         ax.plot(t, here(f"tracked_{name}")[:, u] * scale, color=colour, lw=3, alpha=0.45)
-        _shade(ax, t, here("shadowed")[:, u] & seen, colour)
+        _shade(ax, t, here("occluded")[:, u] & seen, colour)
     forms: dict[str, dict[str, Any]] = {
         "truth": {"lw": 0.9},
         "detection": {"marker": ".", "ls": "none"},
         "track": {"lw": 3, "alpha": 0.45},
     }
-    if (here("shadowed") & here("in_view")).any():
+    if (here("occluded") & here("in_view")).any():
         forms["occluded"] = {"marker": "s", "ms": 7, "mew": 0, "ls": "none", "alpha": 0.2}
     for label, style in forms.items():
         ax.plot([], [], color="#606060", label=label, **style)
@@ -258,7 +258,7 @@ def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Ax
 
 
 def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
-    """Symbol error rates of every data frame; frames without a decision and shadowed ones stand
+    """Symbol error rates of every data frame; frames without a decision and occluded ones stand
     out."""
     t, total = dataset.time.values, dataset.symbol_total.values[:, observer]
     for s, colour, mark in ((0, "#0072B2", "o"), (1, "#D55E00", "s")):
@@ -283,7 +283,7 @@ def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
         label = f"erased ({lost.sum()} of {data.sum()} frames)"
         ax.plot(t[lost], np.full(lost.sum(), 1.06), "x", color="#303030", ms=4, label=label)
     sender = list(dataset.uav.values).index(dataset.transmitter.values[observer])
-    hidden = dataset.shadowed.values[:, observer, sender]
+    hidden = dataset.occluded.values[:, observer, sender]
     _shade(ax, t, hidden, "#303030")
     if hidden.any():
         label = f"{dataset.transmitter.values[observer]} occluded"

@@ -112,10 +112,10 @@ def _cut(axis: np.ndarray, occupied: np.ndarray) -> tuple[float, float]:
 
 
 def _expected(dataset: xr.Dataset, frame: int, observer: int) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity and range at which the map shows the UAVs in view and unshadowed, velocity folded
+    """Velocity and range at which the map shows the UAVs in view and unoccluded, velocity folded
     into the map's span."""
     here = frame, observer
-    seen = dataset.in_view.values[here] & ~dataset.shadowed.values[here]
+    seen = dataset.in_view.values[here] & ~dataset.occluded.values[here]
     r, v = dataset.truth_range.values[here][seen], dataset.truth_velocity.values[here][seen]
     axis = dataset.map_velocity.values[observer]
     axis = axis[np.isfinite(axis)]

@@ -40,8 +40,8 @@ CREASE = np.deg2rad(20.0)
 ROLE_SYMBOLS = {"active": "diamond", "passive": "square", "target": "circle"}
 _AXES = "xyz"
 _SHOWN = frozenset(
-    "uav role uav_position observer track_observer track_frame track_confirmed picture fused_frame "
-    "fused_picture fused_terminal fused_x fused_y fused_z".split()
+    "uav role uav_position observer track_observer track_frame track_confirmed owner fused_frame "
+    "fused_owner fused_terminal fused_x fused_y fused_z".split()
 )
 """What changes from frame to frame, beside paths. A look-up by name takes the longer the more
 variables a dataset has."""
@@ -278,12 +278,12 @@ class _Moving:
         kinds = dataset.kind.values
         self._kinds = [int(k) for k in shown if kinds[k] not in ("diffuse", "leakage")]
         self._kept = np.unique(dataset.path_frame.values)
-        together = "picture" in dataset.variables
-        self._pictures = [str(name) for name in dataset.picture.values] if together else []
+        together = "owner" in dataset.variables
+        self._owners = [str(name) for name in dataset.owner.values] if together else []
         self.names = [
             "UAVs",
             *(f"tracks of {observer}" for observer in dataset.observer.values),
-            *(f"fused tracks of {'the ' * (name == SWARM)}{name}" for name in self._pictures),
+            *(f"fused tracks of {'the ' * (name == SWARM)}{name}" for name in self._owners),
             *(f"{words(kinds[k])} paths" for k in self._kinds),
         ]
         self._paths = {int(kept): self._paths_of(dataset, int(kept)) for kept in self._kept}
@@ -301,12 +301,12 @@ class _Moving:
             }
             for o in range(d.sizes["observer"])
         ]
-        pictures = [
+        fused = [
             {**mark, "marker": self._mark(name), **points_of(fused_positions(d, frame, name))}
-            for name in self._pictures
+            for name in self._owners
         ]
         nearest = self._kept[np.argmin(np.abs(self._kept - frame))] if self._kept.size else -1
-        traces = [uavs, *tracks, *pictures, *self._paths.get(int(nearest), [])]
+        traces = [uavs, *tracks, *fused, *self._paths.get(int(nearest), [])]
         return [trace | {"name": n} for trace, n in zip(traces, self.names, strict=True)]
 
     def _mark(self, name: str) -> dict[str, Any]:

@@ -133,7 +133,7 @@ def _parts(
 
 
 _FOUND = {"In view": "in_view", "Found": "hit_rate", "Tracked": "tracked_rate"}
-_GOSPA = {"GOSPA [m]": "total_m", "No tracks [m]": "empty_m"}
+_GOSPA = {"GOSPA [m]": "total_m", "No tracks [m]": "no_tracks_m"}
 _FALSE = "False tracks per frame"
 _SCORE = (*_FOUND, _FALSE, *_GOSPA)
 
@@ -215,7 +215,7 @@ _CITY = ("ghost", "specular", "diffuse")
 def city_costs(summary: Mapping[str, Any]) -> Table:
     """Tabulate the targets that each set of receivers loses to the city, and the false tracks that
     the city causes; no rows where none are compared."""
-    causes = {"Masked": "masked", "Clutter": "clutter", "Not decoded": "not_read"}
+    causes = {"Masked": "masked", "Clutter": "clutter", "Not decoded": "erased"}
     rows = []
     for link, name, one in _sets(summary):
         noise_only, hits = one["bounds"]["clutter_free"], one["hit_rate"]
@@ -345,7 +345,7 @@ def _traffic(fused: Mapping[str, Any], receives: bool) -> tuple[str, str, str]:
     lost messages."""
     if not receives:
         return DASH, DASH, DASH
-    bits = f"{number(fused['bits'] / 1e3)} of {number(fused['bits_room'] / 1e3)}"
+    bits = f"{number(fused['bits'] / 1e3)} of {number(fused['bits_capacity'] / 1e3)}"
     lost = f"{fused['messages_lost']} of {fused['messages']}"
     return number(fused["left_out"]), bits, lost
 
@@ -415,7 +415,7 @@ def loss_table(summary: Mapping[str, Any], group: str) -> Table:
     """Tabulate the outcome of every target-frame in view; causes without frames are left out."""
     rows = list(_uavs(summary, group))
     causes = [c for c in LOSSES if any(t["losses"][c] for _, _, t in rows)]
-    words = ("not decoded" if cause == "not_read" else cause for cause in causes)
+    words = ("not decoded" if cause == "erased" else cause for cause in causes)
     titles = (cause.replace("_", " ").capitalize() for cause in words)
     return Table(
         ("Link", "UAV", *titles),

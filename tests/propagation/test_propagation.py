@@ -381,7 +381,7 @@ def test_no_reference_is_an_error_that_says_so():
         free_space(uavs).reference_amplitude(POSES, Link("A", "A"))
 
 
-def test_reference_is_the_strongest_echo_unshadowed_and_on_boresight():
+def test_reference_is_the_strongest_echo_unoccluded_and_on_boresight():
     """The passive terminal is nearer and larger here, so it is the reference."""
     d = np.linalg.norm(RX.position - TX.position)
     expected = 3.7 * LAMBDA * np.sqrt(10**-0.33 / (4 * np.pi) ** 3) / d**2

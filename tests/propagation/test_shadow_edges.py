@@ -94,7 +94,7 @@ def test_line_of_sight_and_echo_of_a_half_plane():
     Fresnel integral of nu = h sqrt(2 (d1 + d2)/(lambda d1 d2)), amplitude and phase, the echo (both
     ways) its square.
 
-    Within 3e-3 of the unshadowed field over -2.8 < nu < 8: between the small-angle nu and the true
+    Within 3e-3 of the unoccluded field over -2.8 < nu < 8: between the small-angle nu and the true
     detour lies (h/d)^2/4 of the phase pi nu^2/2, 2e-4 of 100 rad. Planted bug: the detour's phase
     both in the gain and in the delay.
     """

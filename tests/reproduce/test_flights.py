@@ -21,7 +21,7 @@ from reproduce.flights import GOALS, Goal
 
 
 def block(role, found, tracked, bound=1.0, gospa=(1.0, 4.0)):
-    of_gospa = dict(zip(("total_m", "empty_m"), gospa, strict=True))
+    of_gospa = dict(zip(("total_m", "no_tracks_m"), gospa, strict=True))
     counts = {"hit_rate": [round(40 * found), 40], "tracked_rate": [tracked, 40]}
     about = {"role": role, "counts": counts, "bounds": {flights.BOUND: bound}, "gospa": of_gospa}
     return {**about, "tracked_rate": tracked / 40, "false_tracks_per_frame": 0.1}

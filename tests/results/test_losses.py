@@ -339,7 +339,7 @@ STRONG |= {"matched": 1e4, "cell": 10.0, "clutter": 0.1, "background": 0.0, "mas
 TRUTHS = {
     Loss.FOUND: {"hit": True},
     Loss.TOO_WEAK: {"matched": 19.0},
-    Loss.NOT_READ: {"read": False},
+    Loss.ERASED: {"read": False},
     Loss.INACCURATE: {"own": True},
     Loss.NOISE: {"cell": 0.4},
     Loss.MASKED: {"masked": True},

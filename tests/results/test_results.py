@@ -16,7 +16,15 @@ from fake_run import TIMING, fake_records, fake_run, fake_scenario
 from isac_rt import storage
 from isac_rt.results import provenance
 from isac_rt.results.dataset import errors_of, read
-from isac_rt.results.files import ResultsError, check_folder, open_results, save
+from isac_rt.results.files import (
+    RENAMED,
+    ResultsError,
+    check_folder,
+    new_variables,
+    open_results,
+    save,
+    with_new_names,
+)
 from isac_rt.results.recorder import kept_of_paths
 from isac_rt.results.records import KINDS, Use
 from isac_rt.runtime import UserError
@@ -256,8 +264,9 @@ EARLIER = Path(__file__).parent / "earlier"
 
 
 def test_runs_of_earlier_versions_are_opened(tmp_path):
-    """What they held is still there under the same name, over the same dimensions, in the same
-    unit; and they are opened, drawn and reported. Planted bug: `state` called `status`."""
+    """What they held is still there under its present name, over the same dimensions, in the same
+    unit; and they are opened, drawn and reported. Planted bugs: `state` called `status`;
+    `shadowed` left out of `RENAMED`."""
     layout = json.loads((EARLIER / "layout.json").read_text())
     fill = {"object": "A", "bool": False}
     variables = {
@@ -278,11 +287,32 @@ def test_runs_of_earlier_versions_are_opened(tmp_path):
     assert write_report(old, tmp_path, []).is_file()
     new = simulate.run(old.scenario, snapshots=1)
     for name, (dims, dtype, units) in layout["variables"].items():
-        variable = new.dataset[name]
-        assert list(variable.dims) == dims, name
+        now = RENAMED.get(name, name)
+        variable = new.dataset[now]
+        assert now in old.dataset and list(variable.dims) == dims, name
         assert (str(variable.dtype), variable.attrs["units"]) == (dtype, units), name
     assert set(layout["attributes"]) <= set(new.dataset.attrs)
     assert missing(old.summary, new.summary) == GIVEN_UP
+
+
+def test_names_of_earlier_versions_are_replaced():
+    """UAVs keep their names. Planted bugs: a mapping's key replaced; `picture` left out."""
+    summary = {"hidden": {"hidden": 3, "losses": {"not_read": 1}}, "gospa": {"empty_m": None}}
+    new = {"hidden": {"occluded": 3, "losses": {"erased": 1}}, "gospa": {"no_tracks_m": None}}
+    assert with_new_names(summary) == new
+    old = xr.Dataset(
+        {
+            "picture_gospa": (("frame", "picture"), np.zeros((3, 2))),
+            "picture_room": (("frame", "picture"), np.ones((3, 2))),
+            "fused_picture": ("fused", [0, 1, 1]),
+            "loss": ((), 2, {"flag_meanings": "found not_read"}),
+        },
+        {"picture": ["swarm", "A"]},
+    )
+    found = new_variables(old)
+    assert found.fused_gospa.dims == ("frame", "owner")
+    assert {*found.variables} == {"owner", "fused_gospa", "fused_capacity", "fused_owner", "loss"}
+    assert found.loss.flag_meanings.split()[:3] == ["found", "too_weak", "erased"]
 
 
 def missing(old, new, at="summary"):
@@ -300,7 +330,7 @@ def test_what_was_kept_of_the_paths_is_means_and_the_worst():
 
     def use(found, kept, bounces, left_out, error):
         worst = dict.fromkeys(("plane_error", "straight_error", "turning_error"), error)
-        counts = dict.fromkeys(("unheard", "weak", "plane", "straight"), 2 * found)
+        counts = dict.fromkeys(("filtered", "weak", "plane", "straight"), 2 * found)
         own = {"found": found, "kept": kept, "bounces": bounces, "left_out": left_out}
         return read("use", Use(**counts, **worst, **own), 3)
 

@@ -222,10 +222,10 @@ def test_what_became_of_a_uav_at_the_active_terminal(name):
     ("points", "reception", "expected"),
     [
         ([BESIDE], {}, Loss.FOUND),
-        ([], {}, Loss.NOT_READ),
+        ([], {}, Loss.ERASED),
         ([], read(DATA), Loss.OTHER),
-        ([], read(DATA) | {"placed": False}, Loss.NOT_READ),
-        ([], read(DATA, 0.6), Loss.NOT_READ),
+        ([], read(DATA) | {"placed": False}, Loss.ERASED),
+        ([], read(DATA, 0.6), Loss.ERASED),
         ([], read(DATA, 0.4), Loss.OTHER),
         ([BESIDE], read(DATA, 0.6), Loss.FOUND),
     ],
@@ -262,11 +262,11 @@ def test_two_uavs_are_told_apart_by_their_paths():
     assert [OBSERVERS[name].read(record) for name in ("num_false", "num_clutter")] == [1, 1]
 
 
-def test_shadowed_or_behind_is_not_in_view():
-    """U1 without a path is in view and shadowed; PT1, behind nobody, has none at the AT either."""
+def test_occluded_or_behind_is_not_in_view():
+    """U1 without a path is in view and occluded; PT1, behind nobody, has none at the AT either."""
     record = scored(scorer("AT"), DATA, [path_of("AT", "U2", DATA, 3.0)])
     assert record.uavs.in_view.tolist() == [True, False, True, True]
-    assert record.uavs.shadowed.tolist() == [True, False, True, False]
+    assert record.uavs.occluded.tolist() == [True, False, True, False]
     assert record.uavs.loss.tolist() == [-1, -1, -1, Loss.OTHER]
 
 
@@ -396,7 +396,7 @@ def test_what_is_outside_the_view_or_bent_is_not_asked_for():
     narrow = replace(ANTENNAS, half_view=0.05)
     judge = Scorer(Link("AT", "AT"), narrow, SWARM, TIMETABLE, Receivers())
     record = scored(judge, DATA, rows)
-    assert (record.uavs.in_view[0], record.uavs.shadowed[0], record.uavs.loss[0]) == (
+    assert (record.uavs.in_view[0], record.uavs.occluded[0], record.uavs.loss[0]) == (
         False,
         False,
         -1,
@@ -412,7 +412,7 @@ def test_what_is_outside_the_view_or_bent_is_not_asked_for():
     heard = LinkResult(Reception.undecoded(W, detections([])), track_set("AT", DATA, []), 1)
     bent = pathset("AT", rows, np.ones((1, 2, 3)))
     record = scorer("AT").record(DATA, bent, sent, heard, NOISE)
-    assert (record.uavs.in_view[0], record.uavs.shadowed[0], record.uavs.loss[0]) == (
+    assert (record.uavs.in_view[0], record.uavs.occluded[0], record.uavs.loss[0]) == (
         True,
         True,
         -1,

@@ -17,7 +17,7 @@ def row(seen=(1, 1), errors=(None, None), tracks=(), **more):
     """One frame of two UAVs, targets: errors of detections (range, velocity, azimuth, elevation)
     [SI, rad], tracks of (id, false, kind, target, followed UAV)."""
     seen = np.array(seen, bool)
-    out = {"in_view": seen, "shadowed": np.zeros(2, bool), "hit": np.zeros(2, bool)}
+    out = {"in_view": seen, "occluded": np.zeros(2, bool), "hit": np.zeros(2, bool)}
     out |= {"loss": np.where(seen, Loss.OTHER, -1), "num_false": 0, "num_clutter": 0, **GOSPA}
     out |= {"cooperative": np.array([False, False])}
     out |= {
@@ -111,11 +111,11 @@ def test_counts_add_up():
     assert block["false_per_frame"] == pytest.approx(1.0)
 
 
-def test_hidden_is_not_in_view():
+def test_occluded_is_not_in_view():
     """In the field of view but behind the city."""
-    rows = [row(shadowed=np.array([True, False])), row()]
+    rows = [row(occluded=np.array([True, False])), row()]
     one, two = sensing(rows).targets(["U1", "U2"]).values()
-    assert (one["in_view"], one["hidden"], two["in_view"], two["hidden"]) == (1, 1, 2, 0)
+    assert (one["in_view"], one["occluded"], two["in_view"], two["occluded"]) == (1, 1, 2, 0)
 
 
 def test_gospa_is_the_root_of_its_parts():
@@ -132,9 +132,9 @@ def test_gospa_is_the_root_of_its_parts():
     assert found["total_m"] == pytest.approx(np.sqrt((13.0 + 25.0) / 2))
     parts = found["localisation_m"] ** 2 + 12.5 * (found["missed"] + found["false"])
     assert found["total_m"] ** 2 == pytest.approx(parts)
-    assert found["empty_m"] == pytest.approx(np.sqrt((2 * 12.5 + 0) / 2))
+    assert found["no_tracks_m"] == pytest.approx(np.sqrt((2 * 12.5 + 0) / 2))
     five = sensing([row(), row(seen=(1, 0)), row()]).block()["gospa"]
-    assert five["empty_m"] == pytest.approx(np.sqrt(5 * 12.5 / 3))
+    assert five["no_tracks_m"] == pytest.approx(np.sqrt(5 * 12.5 / 3))
 
 
 def test_false_tracks_by_cause():
@@ -217,7 +217,7 @@ def test_targets_alone_are_scored_and_terminals_stand_beside():
     assert block["snr_db"] == pytest.approx(levels, abs=0.005)
     assert terminals["snr_db"] == pytest.approx(levels | {"clutter": 0}, abs=0.005)
     assert block["gospa"]["total_m"] == pytest.approx(np.sqrt(12.5 / 3))
-    assert block["gospa"]["empty_m"] == pytest.approx(np.sqrt(12.5 * 2 / 3))
+    assert block["gospa"]["no_tracks_m"] == pytest.approx(np.sqrt(12.5 * 2 / 3))
     # errors of 1 and 3 cm of the target, of 5 cm of the terminal where both are in view
     told = {"cooperative": np.array([False, True])}
     off = [row(errors=((0.01, 0, 0, 0), (0.05, 0, 0, 0)), **told)]

@@ -52,7 +52,7 @@ def observers(hits=()):
         link: SimpleNamespace(
             uavs=SimpleNamespace(
                 in_view=np.array(seen, bool),
-                shadowed=np.zeros(5, bool),
+                occluded=np.zeros(5, bool),
                 hit=hit & np.array(seen, bool),
             )
         )
@@ -150,7 +150,7 @@ def test_figures_of_a_run_by_hand():
     ]
     tables = tuple(
         np.concatenate([read(kind, r, len(PLACES)) for r in frames])
-        for kind in ("picture", "fused")
+        for kind in ("fused_set", "fused")
     )
     found = summary_of({SWARM: tables, "PT": tables}, list(PLACES))
     one = found["terminals"]["PT"]
@@ -162,7 +162,7 @@ def test_figures_of_a_run_by_hand():
     assert one["gospa"]["total_m"] == pytest.approx(np.sqrt(sum(parts)))
     assert one["gospa"]["missed"] == pytest.approx(1.0)
     assert one["gospa"]["false"] == pytest.approx(1 / 3) == one["false_tracks_per_frame"]
-    assert one["gospa"]["empty_m"] == pytest.approx(5.0)
+    assert one["gospa"]["no_tracks_m"] == pytest.approx(5.0)
     assert one["age_s"] == pytest.approx(0.2)
     assert one["reports_per_frame"] == pytest.approx(1.0)
     assert (one["messages"], one["messages_lost"]) == (3, 1)

@@ -54,7 +54,7 @@ def test_only_terminals_are_wrong():
     alone = {name: uav for name, uav in scenario().swarm.items() if name != "PT"}
     for change in ({}, {"belief": belief}):
         d = simulate.run(scenario(frames=6, swarm=alone, **change), snapshots=0).dataset
-        (k,) = np.flatnonzero((d.fused_frame.values == 5) & (d.fused_picture.values == 0))
+        (k,) = np.flatnonzero((d.fused_frame.values == 5) & (d.fused_owner.values == 0))
         places.append([float(d[f"fused_{axis}"].values[k]) for axis in "xyz"])
     setup = prepare(scenario(frames=6, belief=belief))
     pose = setup.swarm.trajectories["AT"].pose(0.0)

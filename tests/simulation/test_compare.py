@@ -145,7 +145,7 @@ def test_every_target_frame_in_view_has_one_cause(compared):
                     assert t["losses"]["found"] == t["found"]
                 for cause in LOSSES:
                     assert sum(t["losses"][cause] for t in of_uavs) == b["losses"][cause]
-    seen = d.in_view.values & ~d.shadowed.values
+    seen = d.in_view.values & ~d.occluded.values
     assert seen.any()
     assert ((d.loss.values >= 0) == seen).all()
     for i, link in enumerate(summary["links"].values()):

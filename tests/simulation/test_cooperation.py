@@ -61,16 +61,16 @@ def test_detections_are_heard_as_the_links_carry_them(pooled):
     tracks 16 and 165; the newest frame's fit and no other's. The feedback has 1000. Planted
     bugs: what a pilot carries; bits of lost messages left out."""
     d, p = pooled.dataset, pooled.summary["swarm"]["terminals"]
-    k = list(d.picture.values).index("PT")
-    assert d.picture_room.values[:, k].tolist() == [0, 0] + [886] * 7
-    assert d.picture_reports.values[:3, k].tolist()[:2] == [0, 0]
-    assert (d.picture_reports.values[3:, k] > 0).all()
-    assert (d.picture_bits.values[:, k] <= 886).all()
-    assert p["PT"]["bits"] == d.picture_bits.values[:, k].sum()
-    assert p["PT"]["bits_room"] == 886 * 7
-    whole = d.picture_bits.values[3:, k] == 64 + 136 + 208 + 2 * (16 + 165)
+    k = list(d.owner.values).index("PT")
+    assert d.fused_capacity.values[:, k].tolist() == [0, 0] + [886] * 7
+    assert d.fused_reports.values[:3, k].tolist()[:2] == [0, 0]
+    assert (d.fused_reports.values[3:, k] > 0).all()
+    assert (d.fused_bits.values[:, k] <= 886).all()
+    assert p["PT"]["bits"] == d.fused_bits.values[:, k].sum()
+    assert p["PT"]["bits_capacity"] == 886 * 7
+    whole = d.fused_bits.values[3:, k] == 64 + 136 + 208 + 2 * (16 + 165)
     assert whole.sum() >= 4
-    assert p["PT"]["left_out"] == d.picture_left_out.values[:, k].sum()
+    assert p["PT"]["left_out"] == d.fused_left_out.values[:, k].sum()
 
 
 def one_body_in_all_pictures(d):
@@ -78,8 +78,8 @@ def one_body_in_all_pictures(d):
     and under one name, and nothing else that is no terminal."""
     last = d.fused_frame.values == 8
     names = set()
-    for p in range(d.sizes["picture"]):
-        mine = last & (d.fused_picture.values == p)
+    for p in range(d.sizes["owner"]):
+        mine = last & (d.fused_owner.values == p)
         (k,) = np.flatnonzero(mine & (d.fused_uav.values == 2))
         assert d.fused_members.values[k] == 2
         names.add((int(d.fused_origin.values[k]), int(d.fused_number.values[k])))
@@ -109,9 +109,9 @@ def test_who_hears_what_and_when(talked):
     d = talked.dataset
     received = {"AT": ([1] * 6, [0.02] * 6), "PT": ([1, 2, 2, 2, 2, 2], [0.02] + [0.03] * 5)}
     for name, (count, age) in received.items():
-        p = list(d.picture.values).index(name)
-        assert d.picture_reports.values[:, p].tolist() == [0] * 3 + count
-        assert np.allclose(d.picture_age.values[3:, p], age)
+        p = list(d.owner.values).index(name)
+        assert d.fused_reports.values[:, p].tolist() == [0] * 3 + count
+        assert np.allclose(d.fused_age.values[3:, p], age)
 
 
 def test_the_target_is_one_body_of_two_tracks_and_the_terminals_are_none(talked):
@@ -172,7 +172,7 @@ def test_the_report_and_the_moving_picture_show_the_pictures(talked):
     assert table.rows[2][-1].startswith("0 of ")
     traffic = talked.summary["swarm"]["terminals"]["PT"]
     assert table.rows[2][-3] == str(traffic["left_out"]) and traffic["left_out"] > 0
-    assert traffic["bits"] < traffic["bits_room"] == 886 * 7
+    assert traffic["bits"] < traffic["bits_capacity"] == 886 * 7
     d = talked.dataset
     corners, faces = np.eye(3), np.array([[0, 1, 2]])
     roof = CityMesh("roof", corners, faces, np.zeros(1, np.int16), (), np.zeros(3))
@@ -183,7 +183,7 @@ def test_the_report_and_the_moving_picture_show_the_pictures(talked):
         uavs = {trace["name"]: trace for trace in scene["frames"][8]["data"]}
         shown = uavs["fused tracks of the swarm" if name == SWARM else f"fused tracks of {name}"]
         assert [shown[a] for a in "xyz"] == np.round(found, 2)[:, None].tolist()
-    alone = d.drop_vars([name for name in d.variables if name == "picture"])
+    alone = d.drop_vars([name for name in d.variables if name == "owner"])
     assert fused_positions(alone, 8, SWARM).shape == (0, 3)
     figure, moving = animate(talked, 0)
     moving._func(1)

@@ -80,7 +80,7 @@ def test_the_transmitter_follows_the_advice_one_frame_later(run):
     assert fell_back[1] and not fell_back[-1]
     row = run.summary["sparsity"]["A->A"]
     assert row == {
-        "judged": 12,
+        "tested": 12,
         "dense": int((sparse == 0).sum()),
         "fell_back": int(fell_back.sum()),
     }
@@ -98,7 +98,7 @@ def test_without_the_key_the_advice_is_recorded_and_nothing_changes(run, tmp_pat
         not still.dataset.fell_back.any() and still.dataset.sparse.sel(observer="A").values[0] == 0
     )
     row = still.summary["sparsity"]["A->A"]
-    assert row["judged"] == 3 and row["dense"] >= 1 and row["fell_back"] == 0
+    assert row["tested"] == 3 and row["dense"] >= 1 and row["fell_back"] == 0
     assert "dense" in write_report(run, tmp_path, []).read_text()
 
 

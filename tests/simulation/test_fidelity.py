@@ -295,7 +295,7 @@ def test_what_is_out_of_reach_is_what_the_synthesis_cannot_hear():
 
     heard = np.unique(SynthesisTones.sources(Tones, w)[0])
     assert set(kept.delay) == set(late[heard])
-    assert use.unheard == 60 - heard.size
+    assert use.filtered == 60 - heard.size
 
 
 def test_what_a_cell_loses_stays_under_the_noise_by_the_budget():

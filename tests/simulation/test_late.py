@@ -88,8 +88,8 @@ def test_messages_on_late_frames_come_late(whole):
     """What the AT tells PT2 takes two frames; the message that ends after the first frame that PT2
     reads comes with the one that is read late, those before are lost. Planted bugs: late frames not
     carried; counted as lost for good."""
-    d = whole.dataset.sel(picture="PT2")
-    lost, late = d.picture_lost.values, d.picture_late.values
+    d = whole.dataset.sel(owner="PT2")
+    lost, late = d.fused_lost.values, d.fused_late.values
     waits = whole.dataset.latency_frames.sel(observer="PT2").values
     first = int(np.flatnonzero(waits >= 0)[0])
     assert late.sum() >= 1 and not late[: first + 1].any()

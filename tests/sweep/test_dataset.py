@@ -259,16 +259,16 @@ def test_samples_are_those_of_the_run(folder):
         Samples(out, "val")
 
 
-def test_the_truth_of_a_sample_tells_who_is_shadowed():
+def test_the_truth_of_a_sample_tells_who_is_occluded():
     """Against the dataset of a run with UAVs in view, out of it and behind walls. Planted bug: in
     view instead."""
     dataset = fake_run().dataset
     d = {name: variable.values for name, variable in dataset.variables.items()}
-    view, shadow = d["in_view"], d["shadowed"]
+    view, shadow = d["in_view"], d["occluded"]
     assert shadow.any() and (shadow != view).any() and (shadow == view).any()
     for f, o, u in np.ndindex(shadow.shape):
         told = _truth(d, f, o)["uavs"][str(d["uav"][u])]
-        assert (told["in_view"], told["shadowed"]) == (view[f, o, u], shadow[f, o, u])
+        assert (told["in_view"], told["occluded"]) == (view[f, o, u], shadow[f, o, u])
 
 
 def test_a_shard_that_is_not_whole_is_made_anew(folder):

@@ -212,7 +212,7 @@ class Cooperation(Stateful):
                 read = received[link].reception.decoded and _corrected(symbols[link])
             else:
                 read = received[Link(link.rx, link.tx)].state == TerminalState.TRACKING
-            came[link.rx] += Traffic(room=capacity)
+            came[link.rx] += Traffic(capacity=capacity)
             done = channel.carry(frame, capacity, read)
             if done is not None:
                 message, arrived = done

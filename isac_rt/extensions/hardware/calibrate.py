@@ -60,8 +60,8 @@ class Calibration:
     range_scatter_mm : of the channels' ranges after a delay per transmitter and receiver [mm]
     range_bound_mm : what noise alone makes of a channel's range [mm], the Cramer-Rao bound
     rank_one_share : of the power of the amplitudes at the channels' mean beat
-    left_db, left_deg : standard deviation of these amplitudes' levels [dB] and phases [deg] from
-        rank one
+    residual_db, residual_deg : standard deviation of these amplitudes' levels [dB] and phases [deg]
+        from rank one
     gain_spread_rx_db, gain_spread_tx_db : standard deviation of their mean levels [dB]
     unexplained_db, unexplained_response_db : power within `REACH` cells that one tone per channel
         leaves, and a tone with one linear complex response over the sweep for all channels [dB]
@@ -85,8 +85,8 @@ class Calibration:
     range_scatter_mm: float
     range_bound_mm: float
     rank_one_share: float
-    left_db: float
-    left_deg: float
+    residual_db: float
+    residual_deg: float
     gain_spread_rx_db: float
     gain_spread_tx_db: float
     unexplained_db: float
@@ -155,7 +155,7 @@ def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Ca
     spread = np.abs(left - 1) * np.sqrt(left.size / free)
     levels, metres = _decibels(amplitude), w.range_cell(2)
     plain, fit = (_unexplained(y, cells, respond=respond) for respond in (False, True))
-    _refuse_two(share, plain.left_db, cells.mean() * metres)
+    _refuse_two(share, plain.unexplained_db, cells.mean() * metres)
     pair = fit.amplitude / (rx[:, None] * tx)
     pair_late = (fit.beat - cells + delay / w.delay_step) * w.delay_step
     rx_late, tx_late = _late(capture, cells.mean() * metres, cosines)
@@ -164,12 +164,12 @@ def calibrate(capture: Capture, cosines: tuple[float, float] = (0.0, 0.0)) -> Ca
         range_scatter_mm=scatter * SPEED_OF_LIGHT / 2 * 1e3,
         range_bound_mm=_bound(y, amplitude) * metres * 1e3,
         rank_one_share=share,
-        left_db=float(_decibels(left).std()),
-        left_deg=float(np.rad2deg(np.angle(left).std())),
+        residual_db=float(_decibels(left).std()),
+        residual_deg=float(np.rad2deg(np.angle(left).std())),
         gain_spread_rx_db=float(levels.mean(axis=1).std(ddof=1)),
         gain_spread_tx_db=float(levels.mean(axis=0).std(ddof=1)),
-        unexplained_db=plain.left_db,
-        unexplained_response_db=fit.left_db,
+        unexplained_db=plain.unexplained_db,
+        unexplained_response_db=fit.unexplained_db,
         snr_db=snr_db,
         rx_gain=_levelled(rx * np.exp(-2j * np.pi * w.effective_carrier * rx_late)),
         tx_gain=_levelled(tx * np.exp(-2j * np.pi * w.effective_carrier * tx_late)),
@@ -251,14 +251,14 @@ def _refuse_faint(amplitude: np.ndarray) -> None:
         )
 
 
-def _refuse_two(share: float, left_db: float, metres: float) -> None:
+def _refuse_two(share: float, unexplained: float, metres: float) -> None:
     """Raise a `CaptureError` if the echo that was fitted is not that of one reflector."""
-    if share < LEAST_SHARE or left_db > MAX_RESIDUAL_DB:
+    if share < LEAST_SHARE or unexplained > MAX_RESIDUAL_DB:
         raise CaptureError(
             f"no clear reflector: what stands at {metres:.2f} m has a rank-one share of "
-            f"{share:.3f} (at least {LEAST_SHARE:g}), and one tone leaves {left_db:.1f} dB of it "
-            f"(at most {MAX_RESIDUAL_DB:g}); keep other things out of the reflector's range cells, "
-            "and see whether the file holds whole spectra"
+            f"{share:.3f} (at least {LEAST_SHARE:g}), and one tone leaves {unexplained:.1f} dB "
+            f"of it (at most {MAX_RESIDUAL_DB:g}); keep other things out of the reflector's range "
+            "cells, and see whether the file holds whole spectra"
         )
 
 
@@ -336,7 +336,7 @@ class _Fit(NamedTuple):
     beat: np.ndarray
     amplitude: np.ndarray
     slope: complex
-    left_db: float
+    unexplained_db: float
 
 
 def _unexplained(y: np.ndarray, cells: np.ndarray, respond: bool) -> _Fit:
@@ -371,8 +371,8 @@ def _unexplained(y: np.ndarray, cells: np.ndarray, respond: bool) -> _Fit:
         step, change = equations.solved(damping, respond)
         beat, slope = best[0] + np.clip(step, -0.3, 0.3), best[1] + change
     beat, slope, amplitude = best
-    left_db = 10 * float(np.log10(least / (np.abs(seen) ** 2).sum()))
-    return _Fit(beat.reshape(cells.shape), amplitude.reshape(cells.shape), slope, left_db)
+    unexplained_db = 10 * float(np.log10(least / (np.abs(seen) ** 2).sum()))
+    return _Fit(beat.reshape(cells.shape), amplitude.reshape(cells.shape), slope, unexplained_db)
 
 
 @dataclass(frozen=True)
