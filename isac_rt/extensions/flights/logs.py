@@ -63,7 +63,8 @@ def _thinned(log: FlightLog, file: str) -> FlightLog:
     valid = np.isfinite(log.positions).all(axis=1) & (log.times >= -KEPT_BEFORE_S)
     held = np.flatnonzero((log.times > before) & valid)
     if held.size < 2:
-        raise ValueError(f"{log.note}: {held.size} valid positions from the start on, 2 are needed")
+        said = f"{log.note}: {held.size} of {valid.size} positions are valid and after the start"
+        raise ValueError(f"{said}, 2 are needed; take another part or START")
     step = math.ceil(held.size / MAX_WAYPOINTS)
     note = f"{file}: {log.note}, {held.size} positions, {np.ptp(log.times[held]):.1f} s"
     note += f", one of {step} is taken" if step > 1 else ""

@@ -295,7 +295,7 @@ ENTITIES = '<!DOCTYPE f [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]>'
         (ENTITIES, ("", ""), "#bus", "line 2: a <!DOCTYPE> is not read"),
         ("", ("", ""), "", "name a vehicle as FILE#NAME; there are 2: bus, car.0"),
         ("", ("", ""), "#tram", "name a vehicle as FILE#NAME"),
-        ("", ("", ""), "#bus@9", "bus: 0 valid positions from the start on"),
+        ("", ("", ""), "#bus@9", "bus: 0 of 41 positions are valid"),
         ("", ("", ""), "#bus@soon", "START = 'soon' is no finite number"),
         ("", ("</timestep>", ""), "#bus", "mismatched tag: line"),
         ("", ('time="100.00"', 'time="1:40"'), "#bus", "line 5: time = '1:40' is no finite number"),
