@@ -14,6 +14,7 @@ from scipy import stats
 
 from isac_rt.extensions.access.feedback import correct, frames_to_repair, summarise
 from isac_rt.extensions.access.protocol import Network, establish
+from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.clock import Clock
 from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.frame.link import Link
@@ -251,7 +252,7 @@ def _network(seed: int, snr_db: float) -> tuple[Network, dict[str, Clock]]:
     clocks = {name: Clock(rng.uniform(-80e-9, 80e-9), rng.uniform(-1e-8, 1e-8)) for name in place}
     net = Network(
         waveform=w,
-        antennas=onepath.antennas(w, 2),
+        arrays=Arrays(onepath.antennas(w, 2)),
         schedule=pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng),
         receivers=Receivers(),
         scene=scene,

@@ -144,7 +144,7 @@ class Bench:
         end = start if passes == 2 else replace(other, position=other.position - origin)
         names = kind.clutter, kind.clutter if passes == 2 else f"{kind.clutter}-pt"
         paths = self.scenes.field.paths(
-            LinkState(Link(*names), self.scenes.epoch, start, end), self.antennas
+            LinkState(Link(*names), self.scenes.epoch, start, end), self.scenes.setup.arrays
         )
         other_draw = own_rng.standard_normal((len(paths), 2)) @ np.array([1, 1j]) / np.sqrt(2)
         paths = without_weakest(
@@ -165,8 +165,10 @@ def _mean_amplitude(
     scenes: Scenes, paths: PathSet, names: tuple[str, str], start: Pose, end: Pose
 ) -> np.ndarray:
     """Root of the mean power of a field's paths, without the field's own amplitudes."""
-    seen = scenes.field.seen(LinkState(Link(*names), paths.epoch, start, end))
-    return np.abs(paths.gain / scenes.field.cells.amplitude[seen.index])
+    state = LinkState(Link(*names), paths.epoch, start, end)
+    seen = scenes.field.seen(state)
+    ahead = state.elements(scenes.setup.arrays, seen) > 0  # behind the antennas there is no path
+    return np.abs(paths.gain / scenes.field.cells.amplitude[seen.index[ahead]])
 
 
 def pt_errors(
@@ -175,7 +177,7 @@ def pt_errors(
     """Errors of one group's frame at each SNR, {(symbol, decision): counts}: the delay symbols by
     the strongest cell and by the profiles of unmodulated frames before it (`PILOTS`), the DPSK
     symbols from the cells so decided."""
-    w = replace(bench.waveform, num_groups=1)
+    w = replace(bench.waveform, num_groups=1, checked=None)
     own, other = bench.poses(kind)
     rng = generator(bench.seed, "pt data", kind.clutter, round(kind.speed), frame)
     schedule = bench.scenes.setup.schedule[:1]

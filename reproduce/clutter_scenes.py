@@ -146,7 +146,7 @@ class Scenes:
         s = self.setup
         if mesh_std not in self._expectations:
             city = s.city.displaced(mesh_std, generator(s.scenario.seed, "mesh error"))
-            about = s.scenario.clutter, s.swarm, city, s.waveform, s.antennas, s.scenario.seed
+            about = s.scenario.clutter, s.swarm, city, s.waveform, s.arrays, s.scenario.seed
             self._expectations[mesh_std] = make_expectation(*about)
         copy = self._expectations[mesh_std]
         return copy.clutter(place, pose, self.epoch, self.amplitude)
@@ -171,8 +171,8 @@ class Scenes:
         pose = self.pose(place, speed)
         local = replace(pose, position=pose.position - self.setup.city.origin)
         state = LinkState(Link(place, place), self.epoch, local, local)
-        seen, paths = self.field.seen(state), self.field.paths(state, self.setup.antennas)
-        mean = seen.magnitude * state.elements(self.setup.antennas, seen)
+        seen, paths = self.field.seen(state), self.field.paths(state, self.setup.arrays)
+        mean = seen.magnitude * state.elements(self.setup.arrays, seen)
         mean = mean[mean > 0]  # behind the antennas there is no path
         rng = generator(self.setup.scenario.seed, "amplitudes", place, draw)
         drawn = rng.standard_normal((len(paths), 2)) @ np.array([1, 1j]) / np.sqrt(2)

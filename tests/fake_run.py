@@ -8,7 +8,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.antennas import Arrays, antennas_of
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.pathset import PathKind, make_paths
@@ -256,7 +256,7 @@ def fake_coverage(scenario: Scenario) -> Coverage:
     schedule = conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)
     timetable = timetable_of(scenario, w, schedule)
     return coverage(
-        swarm_of(scenario), timetable, antennas_of(a, w), scenario.receivers, a.schedule
+        swarm_of(scenario), timetable, Arrays(antennas_of(a, w)), scenario.receivers, a.schedule
     )
 
 

@@ -7,13 +7,15 @@ own centroid, which is the body's position.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from isac_rt.frame.link import Link
 from isac_rt.frame.settings import Array, Elements
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.settings import AspectTable
@@ -142,11 +144,6 @@ class Antennas:
         return cls(tx_layout=layouts["tx"], rx_layout=layouts["rx"], **element)
 
     @property
-    def is_l(self) -> bool:
-        """True if both arrays are an L, whose arms can be processed one by one."""
-        return self.tx_layout is None and self.rx_layout is None
-
-    @property
     def num_tx(self) -> int:
         return self.tx_x + self.tx_z - 1 if self.tx_layout is None else len(self.tx_layout)
 
@@ -215,6 +212,46 @@ class Antennas:
         exponent = max(self.gain / 2 - 1, 0.0)
         forward = np.clip(direction[..., 1], 0.0, None)
         return self.gain * np.where(forward > 0, forward**exponent, 0.0)
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """Antennas of all terminals of a run, with the same number of transmit elements each.
+
+    Attributes
+    ----------
+    common : of the terminals that have none of their own
+    own : of the others, by name
+
+    Examples
+    --------
+    >>> four, eight = (Antennas.placed([(0, 0)], [(0.002 * i, 0) for i in range(n)])
+    ...                for n in (4, 8))
+    >>> arrays = Arrays(four, {"PT1": eight})
+    >>> arrays.of("AT").num_rx, arrays.at(Link("AT", "PT1")).num_rx
+    (4, 8)
+    """
+
+    common: Antennas
+    own: Mapping[str, Antennas] = field(default_factory=dict)
+
+    def of(self, name: str) -> Antennas:
+        """Return the antennas of a terminal."""
+        return self.own.get(name, self.common)
+
+    def at(self, link: Link) -> Antennas:
+        """Return the antennas that a link's receiver works with: the transmitter's transmit
+        elements and its own receive elements and field of view. `gain` is the geometric mean of
+        both ends'; `element_gain` has no meaning unless both ends have the same antennas."""
+        sent, received = (self.of(name) for name in link)
+        if sent == received:
+            return received
+        places = tuple((float(x), float(z)) for x, _, z in sent.tx_positions)
+        return replace(received, tx_layout=places, gain=float(np.sqrt(sent.gain * received.gain)))
+
+    def __iter__(self) -> Iterator[Antennas]:
+        yield self.common
+        yield from self.own.values()
 
 
 @lru_cache(maxsize=64)
@@ -298,7 +335,8 @@ def resolutions(waveform: Waveform, antennas: Antennas, passes: int) -> np.ndarr
     beyond all angles along an axis that the array does not observe.
     """
     cells = [waveform.range_cell(passes), waveform.velocity_cell(passes)]
-    if not antennas.is_l:
+    in_arms = antennas.rx_layout is None and (passes == 1 or antennas.tx_layout is None)
+    if not in_arms:
         positions = antennas.virtual_positions if passes == 2 else antennas.rx_positions
         return np.array(
             [*cells, *(waveform.wavelength / aperture_of(positions[:, i]) for i in (0, 2))]

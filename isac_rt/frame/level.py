@@ -60,20 +60,19 @@ def link_budget(
     link: tuple[str, str],
     reference: str,
     distance: float,
-    amplitude: float,
-    noise: Noise,
+    powers: tuple[float, float],
     waveform: Waveform,
     antennas: Antennas,
 ) -> LinkBudget:
-    """Budget of a link from its reference path's amplitude (elements on boresight).
+    """Return the budget of a link from the powers [W] of its reference path (elements on boresight)
+    and of the noise, per sample.
 
     The gain counts N samples and P chirps coherently, less 1.76 dB for each of the two Hann
     windows, and the virtual channels as sqrt(L_tx L_rx), which is what adding powers gives near the
     threshold.
     """
     w = waveform
-    received = (transmit_amplitude(noise) * amplitude) ** 2
-    level = noise_power(noise, w, amplitude)
+    received, level = powers
     channels = antennas.num_tx * antennas.num_rx
     gain = (
         10 * np.log10(w.num_samples * w.num_chirps)

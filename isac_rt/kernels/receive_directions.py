@@ -61,7 +61,8 @@ def line_bounds(maps, channels, spectra, out):
 @jit(fast=True)
 def search_directions(along_x, along_z, turns_z, turns_x, inside, scale, peak, place):
     """`isac_rt.receive.directions.search_directions`, sixteen directions at once."""
-    looks, count, lines, size = along_x.shape[1], along_x.shape[3], *along_z.shape[2:]
+    looks, count = along_x.shape[1], along_x.shape[3]
+    lines, size = along_z.shape[2], along_z.shape[3]
     turns, each, power = turns_z.reshape(-1), scale.reshape(-1), np.empty(count * size, np.float32)
     channels_read, zero = np.empty(looks * 2 * lines * size, np.float32), splat(np.float32(0))
     sine, line = turns_z.shape[1] * size, 2 * lines * size

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.link import Link
 from isac_rt.propagation.model import Census, Traced
 from isac_rt.propagation.pathset import PathKind, PathSet, merge
@@ -37,13 +37,13 @@ class FreeSpace:
     Attributes
     ----------
     uavs : by name, in the order in which paths name them
-    antennas : of every terminal
+    arrays : antennas of every terminal
     wavelength : [m]
     seed : of the cross-sections' fluctuations
     """
 
     uavs: Mapping[str, Uav]
-    antennas: Antennas
+    arrays: Arrays
     wavelength: float
     seed: int
 
@@ -79,7 +79,7 @@ class FreeSpace:
             straight(state.start, end.position[None], end.velocity, end.acceleration)
         )
         gain = friis_amplitude(self.wavelength, scatter_paths.length) * state.elements(
-            self.antennas, scatter_paths
+            self.arrays, scatter_paths
         )
         return state.paths(scatter_paths, gain, PathKind.LINE_OF_SIGHT)
 
@@ -96,7 +96,7 @@ class FreeSpace:
                 amplitude[k] *= 10 ** (rcs.level_db / 20)
             else:
                 amplitude[k] = self._echo(name, poses, there.select(row), back.select(row))
-        elements = state.elements(self.antennas, scatter_paths)
+        elements = state.elements(self.arrays, scatter_paths)
         relative = np.array([self.uavs[name].rcs.model == "relative" for name in others], bool)
         return state.paths(
             scatter_paths,
@@ -130,11 +130,12 @@ class FreeSpace:
         ------
         ValueError  If a terminal's own link has no such UAV.
         """
-        tx, rx = link
-        if not Link(tx, rx).own:
+        tx, rx = link = Link(*link)
+        if not link.own:
             distance = np.linalg.norm(poses[rx].position - poses[tx].position)
-            return float(friis_amplitude(self.wavelength, distance) * self.antennas.gain)
-        return self._own_echoes(poses, tx)[self.strongest_target(poses, tx)] * self.antennas.gain
+            return float(friis_amplitude(self.wavelength, distance) * self.arrays.at(link).gain)
+        echoes = self._own_echoes(poses, tx)
+        return echoes[self.strongest_target(poses, tx)] * self.arrays.of(tx).gain
 
     def has_target(self, tx: str) -> bool:
         """Return whether there is another UAV with a cross-section of its own."""

@@ -337,15 +337,15 @@ class RayTracer:
         segments: dict[Link, SegmentSet],
         discs: UavDiscs,
     ) -> PathSet:
-        link, antennas = state.link, self._free.antennas
+        link, arrays = state.link, self._free.arrays
         parts = [self._by_the_city(state, segments[link])]
         others = [name for name in self._free.names if name not in link]
         if others:
             parts.append(self._by_way_of(state, {name: local[name] for name in others}, segments))
         if self.field is not None:
-            parts.append(self.field.paths(state, antennas, discs))
+            parts.append(self.field.paths(state, arrays, discs))
         if self.two_bounces is not None:
-            parts.extend(self.two_bounces.paths(state, antennas, discs))
+            parts.extend(self.two_bounces.paths(state, arrays, discs))
         if link.own and self._propagation.leakage.enabled:
             parts.append(self._leakage(state))
         return merge(parts, shift=self._city.origin)
@@ -370,7 +370,7 @@ class RayTracer:
         scatter_paths = ScatterPaths.along(found.segments)
         return state.paths(
             scatter_paths,
-            found.amplitude * state.elements(self._free.antennas, scatter_paths),
+            found.amplitude * state.elements(self._free.arrays, scatter_paths),
             np.where(found.bounces > 0, PathKind.SPECULAR, PathKind.LINE_OF_SIGHT),
             bounces=found.bounces,
             points=found.segments.points,
@@ -399,7 +399,7 @@ class RayTracer:
         a, b, bounces = there.segments, back.segments, there.bounces + back.bounces
         scatter = np.sqrt(4 * np.pi * np.concatenate(sections)) / self._free.wavelength
         scatter_paths = ScatterPaths.over(a, b)
-        elements = state.elements(self._free.antennas, scatter_paths)
+        elements = state.elements(self._free.arrays, scatter_paths)
         positions = [pose.position for pose in discs.values()]
         middle = np.repeat(positions, [len(to) for to in sent], axis=0)[:, None]
         chain = [there.faces, np.full((len(there), 1), -1), back.faces[:, ::-1]]

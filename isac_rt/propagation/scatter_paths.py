@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
@@ -65,13 +65,14 @@ class LinkState:
     end: Pose
     target_names: tuple[str, ...] = ()
 
-    def elements(self, antennas: Antennas, scatter_paths: ScatterPaths) -> np.ndarray:
+    def elements(self, arrays: Arrays, scatter_paths: ScatterPaths) -> np.ndarray:
         """(K,) sqrt(G_tx G_rx) of the elements at both ends: the one place where antennas touch a
         gain."""
-        sent = antennas.element_gain(self.start.to_body(scatter_paths.departure))
+        tx, rx = (arrays.of(name) for name in self.link)
+        sent = tx.element_gain(self.start.to_body(scatter_paths.departure))
         if self.link.own and scatter_paths.arrival is scatter_paths.departure:
             return sent
-        return np.sqrt(sent * antennas.element_gain(self.end.to_body(scatter_paths.arrival)))
+        return np.sqrt(sent * rx.element_gain(self.end.to_body(scatter_paths.arrival)))
 
     def paths(
         self,

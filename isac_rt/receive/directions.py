@@ -109,9 +109,10 @@ class Search:
         aperture = np.array([aperture_of(along) for along in places.T])
         beam = np.where(seen, 2 * np.pi / (wavenumber * aperture), 0.0)
         for step in (beam / STEPS_OF_A_BEAM, 2 * beam / STEPS_OF_A_BEAM):
-            u = x, z = tuple(_grid(*of) for of in zip(limits, step, strict=True))
+            x, z = (_grid(*of) for of in zip(limits, step, strict=True))
             if x.size * z.size <= MOST_DIRECTIONS:
                 break
+        u = x, z
         # a channel belongs to the longer of the two lines through it
         row, column = (_numbers(along) for along in places.T[::-1])
         on_x = np.bincount(row)[row] >= np.bincount(column)[column]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import asin, atan2, sqrt
 from typing import NamedTuple
@@ -11,7 +11,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.special import betaincinv
 
-from isac_rt.frame.antennas import Antennas, resolutions
+from isac_rt.frame.antennas import Antennas, Arrays, resolutions
+from isac_rt.frame.link import Link
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Reception
@@ -227,13 +228,18 @@ def binomial_interval(
     return low, high
 
 
-def within_view(antennas: Antennas, own: Pose, active: Pose, uav: Pose) -> bool:
-    """Return whether a target is in the field of view of the receiver and, unless it is the
+def within_view(arrays: Arrays, link: Link, poses: Mapping[str, Pose], uav: str) -> bool:
+    """Return whether a target is in the field of view of a link's receiver and, unless it is the
     transmitter itself, of the transmitter."""
-    ends = [(own, uav)]
-    if uav is active:
-        ends.append((active, own))
-    elif own is not active:
-        ends.append((active, uav))
-    offsets = [(a, b.position - a.position) for a, b in ends]
-    return all(bool(antennas.in_view(a.to_body(d / np.linalg.norm(d)))) for a, d in offsets)
+    tx, rx = link
+    ends = [(rx, uav)]
+    if uav == tx:
+        ends.append((tx, rx))
+    elif tx != rx:
+        ends.append((tx, uav))
+    for here, there in ends:
+        offset = poses[there].position - poses[here].position
+        towards = poses[here].to_body(offset / np.linalg.norm(offset))
+        if not arrays.of(here).in_view(towards):
+            return False
+    return True

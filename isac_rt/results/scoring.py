@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas, azimuth_elevation
+from isac_rt.frame.antennas import Arrays, azimuth_elevation
 from isac_rt.frame.cube import Transmission
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
@@ -78,12 +78,13 @@ class Scorer(Stateful):
     def __init__(
         self,
         link: Link,
-        antennas: Antennas,
+        arrays: Arrays,
         swarm: Swarm,
         timetable: Timetable,
         receivers: Receivers,
     ) -> None:
-        self.link, self._antennas, self._swarm, self._timetable = link, antennas, swarm, timetable
+        self.link, self._arrays, self._swarm, self._timetable = link, arrays, swarm, timetable
+        self._antennas = antennas = arrays.at(link)
         self._passes = 2 if link[0] == link[1] else 1
         self._resolution = Resolution.of(timetable.waveform, antennas, self._passes)
         self._least = CramerRao.of(timetable.waveform, antennas, self._passes)
@@ -206,7 +207,7 @@ class Scorer(Stateful):
             by_way = active if self._passes == 1 and name != tx else None
             truth.append(None if name == rx else truth_of(own, poses[name], by_way))
         inside = np.array(
-            [name != rx and within_view(self._antennas, own, active, poses[name]) for name in names]
+            [name != rx and within_view(self._arrays, self.link, poses, name) for name in names]
         )
         own_paths = owners(paths.kind, paths.target, paths, names)
         some = np.flatnonzero(own_paths >= 0)

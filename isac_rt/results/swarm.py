@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.link import Link
 from isac_rt.frame.timetable import Timetable
 from isac_rt.plain import Stateful
@@ -89,10 +89,10 @@ class Remembered:
 class SwarmScorer(Stateful):
     """Scores fused tracks. It remembers which UAVs each link saw and found last."""
 
-    def __init__(self, timetable: Timetable, antennas: Antennas) -> None:
+    def __init__(self, timetable: Timetable, arrays: Arrays) -> None:
         self._timetable = timetable
         self._resolutions = {
-            link: Resolution.of(timetable.waveform, antennas, 2 if link.own else 1)
+            link: Resolution.of(timetable.waveform, arrays.at(link), 2 if link.own else 1)
             for link in timetable.all_links
         }
         self._origins = [str(link) for link in timetable.labels]

@@ -8,9 +8,13 @@ from contextlib import suppress
 from typing import Any
 
 from isac_rt.frame.front_end import FrontEnd
+from isac_rt.frame.settings import Array, Noise
 from isac_rt.settings import Problem
 from isac_rt.world import settings
 from isac_rt.world.settings import Formation, Waypoint
+
+HARDWARE = ("front_end", "array", "noise")
+"""Keys of a terminal's hardware, which a target has none of."""
 
 
 class Uav(settings.Uav):
@@ -19,17 +23,24 @@ class Uav(settings.Uav):
 
     front_end: FrontEnd | None = None
     """This terminal's hardware in place of `radio.front_end`. null, the default: that of all."""
+    array: Array | None = None
+    """This terminal's antennas: what is stated overrides `array`. As many transmit elements as
+    there. null, the default: those of all."""
+    noise: Noise | None = None
+    """This terminal's transmit power, noise figure or SNR: what is stated overrides `noise`. null,
+    the default: those of all."""
 
     def applies(self, name: str) -> bool:
-        if name == "front_end":
+        if name in HARDWARE:
             return self.role != "target"
         return super().applies(name)
 
     def problems(self) -> Iterator[Problem]:
         yield from super().problems()
-        if self.front_end is not None and self.role == "target":
-            said = "has no meaning for a target, which neither sends nor receives; remove it"
-            yield Problem((("front_end",), ("role",)), said)
+        for key in HARDWARE:
+            if getattr(self, key) is not None and self.role == "target":
+                said = "has no meaning for a target, which neither sends nor receives; remove it"
+                yield Problem(((key,), ("role",)), said)
 
 
 def unfolded(swarm: dict[Any, Any]) -> dict[Any, Any]:

@@ -277,11 +277,13 @@ def _pattern(path: Path) -> dict[str, Any]:
 
 def _tables_of(tree: dict[str, Any], folder: Path) -> Iterator[tuple[Key, str, Reader]]:
     """Mappings of a tree that may name a table, the key that does, and how it is read."""
-    yield ("array", "tx"), "file", _places
-    yield ("array", "rx"), "file", _places
-    yield ("array",), "pattern_file", _pattern
     swarm = tree.get("swarm")
-    for name in swarm if isinstance(swarm, dict) else ():
+    uavs: list[Key] = [("swarm", name) for name in swarm] if isinstance(swarm, dict) else []
+    for owner in [(), *uavs]:
+        yield (*owner, "array", "tx"), "file", _places
+        yield (*owner, "array", "rx"), "file", _places
+        yield (*owner, "array"), "pattern_file", _pattern
+    for _, name in uavs:
         yield ("swarm", name), "flight", partial(_flight, tree.get("city"), folder)
         yield ("swarm", name, "rcs"), "file", by_aspect("dbsm")
 

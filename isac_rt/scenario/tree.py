@@ -216,6 +216,7 @@ class Scenario(Node):
             self._detector_problems,
             self._initiation_problems,
             self._calibration_problems,
+            self._hardware_problems,
             self._front_end_problems,
             self._self_calibration_problems,
             self._set_problems,
@@ -458,6 +459,28 @@ class Scenario(Node):
         """The hardware of a terminal: its own, or that of all."""
         return self.swarm[name].front_end or self.radio.front_end
 
+    def noise_of(self, name: str) -> Noise:
+        """The transmit power and the noise of a terminal: its own, or those of all."""
+        return self.swarm[name].noise or self.noise
+
+    def _hardware_problems(self) -> Iterator[Problem]:
+        """List what terminals with hardware of their own must share."""
+        for name, uav in self.swarm.items():
+            count = self.num_tx if uav.array is None else uav.array.num_tx
+            if count != self.num_tx:
+                said = (
+                    f"{count} transmit elements, and array has {self.num_tx}: all terminals share "
+                    "the order in which these take turns; state as many"
+                )
+                yield Problem((("swarm", name, "array"), ("array",)), said)
+            for key in ("schedule", "fall_back"):
+                if uav.array is not None and getattr(uav.array, key) != getattr(self.array, key):
+                    said = f"all terminals share array.{key}; leave it out"
+                    yield Problem((("swarm", name, "array", key), ("array", key)), said)
+            if uav.noise is not None and uav.noise.model != self.noise.model:
+                said = f"all terminals share noise.model, {self.noise.model}; leave it out"
+                yield Problem((("swarm", name, "noise", "model"), ("noise", "model")), said)
+
     def _self_calibration_problems(self) -> Iterator[Problem]:
         """Schedules by which the channels of an echo cannot be told in one frame."""
         if self.radio.groups == self.num_tx and self.radio.bands(self.num_tx) == 1:
@@ -488,8 +511,9 @@ class Scenario(Node):
             if uav.front_end is not None
         }
         for key, one in stated.items():
+            array = (key[0] == "swarm" and self.swarm[str(key[1])].array) or self.array
             yield from self._element_problems((*key, "transmit"), one.transmit, self.num_tx)
-            yield from self._element_problems((*key, "receive"), one.receive, self.num_rx)
+            yield from self._element_problems((*key, "receive"), one.receive, array.num_rx)
             sent = one.transmit_response
             if sent.differs and self.radio.bands(self.num_tx) > 1:
                 said = (
@@ -622,13 +646,27 @@ def _with_presets(data: Any) -> Any:
     out = with_sensor(data)
     out = with_preset(out, out.get("receiver_preset") or _usual_preset(out), {})
     if isinstance(out.get("swarm"), dict):
-        out["swarm"] = unfolded(out["swarm"])
+        out["swarm"] = {
+            name: _with_own_hardware(uav, out) for name, uav in unfolded(out["swarm"]).items()
+        }
     own = {key: _plain(out.get(key)) for key in ("receivers", "tracking")}
     if isinstance(sets := out.get("compare"), dict):
         out["compare"] = {
             name: with_preset(one, one.get("preset"), own) if isinstance(one, dict) else one
             for name, one in sets.items()
         }
+    return out
+
+
+def _with_own_hardware(uav: Any, data: dict[str, Any]) -> Any:
+    """Complete the array and the noise that a terminal states by those of all."""
+    if not isinstance(uav, dict):
+        return uav
+    out = dict(uav)
+    for key in ("array", "noise"):
+        own, common = _plain(out.get(key)), _plain(data.get(key))
+        if isinstance(own, dict) and isinstance(common, dict):
+            out[key] = {**common, **own}
     return out
 
 

@@ -151,7 +151,7 @@ def _next_slot(setup: Setup) -> float:
 def _late(setup: Setup, paths: PathSet, noise_power: float) -> float:
     """Return the power of the paths whose chirps reach the next slot, over the noise of a cell."""
     power = float(paths.power[paths.delay >= _next_slot(setup)].sum())
-    return power * setup.plan.cell_noise_gain() / noise_power
+    return power * setup.plan.cell_noise_gain(paths.tx) / noise_power
 
 
 def _standing_items(setup: Setup, light: float, late: float, short_lived: float) -> list[Item]:
@@ -205,7 +205,7 @@ def missed_per_frame(setup: Setup, frames: Sequence[int]) -> float:
         when, links = setup.timetable.epoch(frame), list(found)
         halves = [tracer.by_half(k).trace(poses, when, links).paths for k in (0, 1)]
         for link in links:
-            level = setup.noise_power(poses, link) / setup.plan.cell_noise_gain()
+            level = setup.noise_power(poses, link) / setup.plan.cell_noise_gain(link.tx)
             first, second = (_over(half[link], level, COUNTS_DB) for half in halves)
             more = second.select(~present(second, first))
             alone += len(more) + int((~present(first, second)).sum())
@@ -356,7 +356,7 @@ def _errors(
     """Measure the errors of one link and frame; powers are over the noise of a cell."""
     plan, level = setup.plan, frame.noise_power(link)
     kept, use = frame.paths[link], frame.uses[link]
-    ratio = plan.cell_noise_gain() / level
+    ratio = plan.cell_noise_gain(link.tx) / level
     received, weak, _ = plan.chosen(found, level)
     missed = ~present(full, found) & (full.delay <= plan.longest_delay)
     delay = np.append(found.delay[weak], full.delay[missed])
@@ -408,8 +408,8 @@ def _plane_error(setup: Setup, frame: Frame, link: Link, raw: PathSet) -> float:
     total = np.zeros(int(plane.sum()))
     raw = raw.select(plane)
     ends = (
-        (frame.poses[link.tx], setup.antennas.tx_positions, raw.departure, raw.tx_radius),
-        (frame.poses[link.rx], setup.antennas.rx_positions, raw.arrival, raw.rx_radius),
+        (frame.poses[link.tx], setup.arrays.of(link.tx).tx_positions, raw.departure, raw.tx_radius),
+        (frame.poses[link.rx], setup.arrays.of(link.rx).rx_positions, raw.arrival, raw.rx_radius),
     )
     for pose, positions, direction, radius in ends:
         elements = pose.to_world(positions)
@@ -435,7 +435,7 @@ def clutter_by_cell(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the range-Doppler cells in which a link receives the scatterers of a field, and their
     mean powers over the noise of a cell."""
-    level = setup.plan.cell_noise_gain() / frame.noise_power(link)
+    level = setup.plan.cell_noise_gain(link.tx) / frame.noise_power(link)
     origin, epoch = setup.city.origin, setup.timetable.epoch(frame.number)
     start, end = (
         replace(frame.poses[name], position=frame.poses[name].position - origin) for name in link
@@ -444,7 +444,7 @@ def clutter_by_cell(
     seen = field.seen(state)
     received = seen.length < SPEED_OF_LIGHT * setup.plan.longest_delay
     motion = seen.length[received] / SPEED_OF_LIGHT, seen.rate[received] / SPEED_OF_LIGHT
-    power = level * (seen.magnitude * state.elements(setup.antennas, seen))[received] ** 2
+    power = level * (seen.magnitude * state.elements(setup.arrays, seen))[received] ** 2
     return resolution_cell(setup.waveform, *motion), power
 
 
@@ -493,7 +493,7 @@ def _turning_error(setup: Setup, frame: int, kept: PathSet) -> float:
     moving = _with_chains(kept)
     if not len(moving):
         return 0.0
-    antennas, lags = setup.antennas, []
+    antennas, lags = setup.arrays.at(kept.link), []
     for t in (0.0, -reach, reach):
         poses = setup.swarm.poses(epoch + t)
         centre = delays(moving, poses, setup.city)
@@ -573,7 +573,7 @@ def _below_noise_error(setup: Setup, frame: Frame, link: Link, level: float) -> 
     cube = _made(setup, frame, link, kept, method)
     cube.samples[:] -= _made(setup, frame, link, kept, _uncovered(method)).samples
     passes = 2 if link.own else 1
-    known = Known.of(cube, frame.sent[link.tx].payload, setup.antennas, passes)
+    known = Known.of(cube, frame.sent[link.tx].payload, setup.arrays.at(link), passes)
     power = power_map(clean_spectrum(cube, known), known)
     window = 3 / 8 * setup.waveform.window_length
     return float(power.max()) * known.channels / (level * window * window_gain(known))
@@ -587,6 +587,6 @@ def _uncovered(method: Method) -> Method:
 def _made(setup: Setup, frame: Frame, link: Link, paths: PathSet, method: Method) -> IFCube:
     """Synthesise some of a link's paths without noise."""
     links = [(frame.sent[link.tx], paths)]
-    receiver = ReceiveArray(frame.poses[link.rx], setup.antennas)
+    receiver = ReceiveArray(frame.poses[link.rx], setup.arrays.of(link.rx))
     reference = Reference(setup.timetable.start_time(frame.number, link.tx))
     return if_signal(setup.waveform, links, receiver, reference, method)

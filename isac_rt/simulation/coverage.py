@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas, resolutions
+from isac_rt.frame.antennas import Antennas, Arrays, resolutions
 from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import unambiguous_share
 from isac_rt.frame.timetable import Timetable
@@ -105,7 +105,7 @@ class Coverage:
 def coverage(
     swarm: Swarm,
     timetable: Timetable,
-    antennas: Antennas,
+    arrays: Arrays,
     receivers: Receivers,
     schedule: str,
 ) -> Coverage:
@@ -113,7 +113,7 @@ def coverage(
 
     Parameters
     ----------
-    swarm, timetable, antennas : of the run
+    swarm, timetable, arrays : of the run
     receivers : for `min_range_m` and `velocity_method`
     schedule : ``array.schedule``
     """
@@ -125,10 +125,10 @@ def coverage(
     links, outside = [], []
     for link in timetable.all_links:
         here = np.array([link in of_frame for of_frame in received])
-        seen = _link_coverage(link, timetable, antennas, receivers, schedule)
+        seen = _link_coverage(link, timetable, arrays.at(link), receivers, schedule)
         links.append(seen)
         own = {name: flight.at(here) for name, flight in flights.items()}
-        rows = (_outside(link, name, own, antennas, seen) for name in own if name != link.rx)
+        rows = (_outside(link, name, own, arrays, seen) for name in own if name != link.rx)
         outside += [row for row in rows if row.unseen or row.too_fast]
     return Coverage(
         slot_s=w.slot_duration,
@@ -220,14 +220,14 @@ def _segment(start: _Flight, end: _Flight, antennas: Antennas) -> tuple[np.ndarr
 
 
 def _outside(
-    link: Link, name: str, flights: dict[str, _Flight], antennas: Antennas, of: LinkCoverage
+    link: Link, name: str, flights: dict[str, _Flight], arrays: Arrays, of: LinkCoverage
 ) -> Outside:
     tx, rx, uav = (flights[n] for n in (link.tx, link.rx, name))
-    length, rate, in_view = _segment(rx, uav, antennas)
+    length, rate, in_view = _segment(rx, uav, arrays.of(link.rx))
     if name == link.tx:  # the line of sight
-        in_view &= _segment(tx, rx, antennas)[2]
+        in_view &= _segment(tx, rx, arrays.of(link.tx))[2]
     elif not link.own:
-        first, first_rate, lit = _segment(tx, uav, antennas)
+        first, first_rate, lit = _segment(tx, uav, arrays.of(link.tx))
         length, rate, in_view = length + first, rate + first_rate, in_view & lit
     half = of.range_resolution_m / 2  # a path is looked for in the row that is nearest
     far, near = length >= of.max_range_m - half, length < of.min_range_m - half

@@ -28,14 +28,14 @@ of half a chirp of P at either end, 1/(2 P) of the path's amplitude."""
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, Arrays
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.kernels.signal_gridded import GRIDDED_ERROR
@@ -72,16 +72,16 @@ class Plan:
     Attributes
     ----------
     accuracy, propagation : settings of the scenario
-    antennas, timetable, swarm : of the run
-    amplitude : sqrt(transmit power) of an antenna [sqrt(W)]
+    arrays, timetable, swarm : of the run
+    amplitudes : sqrt(transmit power) of an antenna of each terminal [sqrt(W)]
     """
 
     accuracy: Accuracy
     propagation: Propagation
-    antennas: Antennas
+    arrays: Arrays
     timetable: Timetable
     swarm: Swarm
-    amplitude: float
+    amplitudes: Mapping[str, float]
 
     @property
     def waveform(self) -> Waveform:
@@ -180,15 +180,15 @@ class Plan:
         flown_distance = 2 * fastest * frame_reach(self.waveform)
         return float(np.ceil(farthest + self.reach + flown_distance + REACH_MARGIN_M))
 
-    def cell_noise_gain(self) -> float:
-        """|gain|^2 of a path over this is its power over the noise of a range-Doppler-antenna cell,
-        per watt of noise in a sample."""
-        return self.amplitude**2 * self.waveform.num_samples * self.waveform.num_chirps
+    def cell_noise_gain(self, tx: str) -> float:
+        """Return the factor from |gain|^2 of a path of a transmitter to its power over the noise of
+        a range-Doppler-antenna cell, per watt of noise in a sample."""
+        return self.amplitudes[tx] ** 2 * self.waveform.num_samples * self.waveform.num_chirps
 
     def chosen(self, paths: PathSet, noise_power: float) -> tuple[np.ndarray, np.ndarray, float]:
         """Mark received paths and those too weak, (K,) bool each; also return the largest omitted
         power of a range cell over the noise."""
-        over_noise = paths.power * self.cell_noise_gain() / noise_power
+        over_noise = paths.power * self.cell_noise_gain(paths.tx) / noise_power
         everything = self.preset == "everything"
         received = (
             np.full(len(paths), True)
@@ -210,10 +210,10 @@ class Plan:
         paths : all that were found
         noise_power : of a sample at the receiver [W]
         """
-        w = self.waveform
+        w, antennas = self.waveform, self.arrays.at(paths.link)
         received, weak, left_out = self.chosen(paths, noise_power)
         kept = paths.select(received & ~weak)
-        plane_error, straight_error = plane_bound(kept, self.antennas, w), straight_bound(kept, w)
+        plane_error, straight_error = plane_bound(kept, antennas, w), straight_bound(kept, w)
         plane, straight = plane_error <= self.phase_share, straight_error <= self.phase_share
         use = Use(
             found=len(paths),
@@ -226,7 +226,7 @@ class Plan:
             straight=int(straight.sum()),
             plane_error=float(plane_error[plane].max(initial=0.0)),
             straight_error=float(straight_error[straight].max(initial=0.0)),
-            turning_error=float(turning_bound(kept, self.antennas, w, self.swarm).max(initial=0.0)),
+            turning_error=float(turning_bound(kept, antennas, w, self.swarm).max(initial=0.0)),
         )
         left = replace(
             kept,

@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from isac_rt.document import ScenarioError, ScenarioWarning
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, Arrays
 from isac_rt.frame.link import Link
 from isac_rt.frame.settings import Noise
 from isac_rt.frame.timetable import Timetable
@@ -58,7 +58,7 @@ def receivers_at_work() -> int:
     return (os.cpu_count() or 1) + 1
 
 
-def check_memory(antennas: Antennas, timetable: Timetable) -> None:
+def check_memory(arrays: Arrays, timetable: Timetable) -> None:
     """Refuse a run that exceeds the free memory.
 
     Raises
@@ -67,7 +67,10 @@ def check_memory(antennas: Antennas, timetable: Timetable) -> None:
     """
     free, links = available_memory(), len(timetable.all_links)
     at_work = receivers_at_work()
-    needed = memory_needed(timetable.waveform, antennas, timetable.frames, links, at_work)
+    needed = max(
+        memory_needed(timetable.waveform, antennas, timetable.frames, links, at_work)
+        for antennas in arrays
+    )
     if free is not None and needed > free:
         raise ScenarioError(
             f"the run would need about {needed / 1e9:.3g} GB of memory, {free / 1e9:.3g} GB are "
@@ -210,7 +213,7 @@ def _said(position: np.ndarray) -> str:
 
 
 def warn_of_aliases(
-    swarm: Swarm, timetable: Timetable, antennas: Antennas, velocity_method: str, schedule: str
+    swarm: Swarm, timetable: Timetable, arrays: Arrays, velocity_method: str, schedule: str
 ) -> None:
     """Warn of UAVs in the field of view beyond the unambiguous velocity: their velocity aliases by
     a period, and the time offsets of groups give weak further detections.
@@ -227,7 +230,8 @@ def warn_of_aliases(
         tx, rx = link
         limit = unambiguous_velocity(link, timetable, velocity_method, schedule)
         for name in [n for n in swarm.uavs if n != tx] if link.own else [rx]:
-            rates = np.array([_closing(at[tx], at[name], antennas, link.passes) for at in poses])
+            ends = [arrays.of(n) for n in link][: link.passes % 2 + 1]
+            rates = np.array([_closing(at[tx], at[name], ends) for at in poses])
             worst = int(np.abs(rates).argmax())
             if abs(rates[worst]) > limit:
                 shown = (rates[worst] + limit) % (2 * limit) - limit
@@ -241,23 +245,22 @@ def warn_of_aliases(
                 )
 
 
-def _closing(own: Pose, other: Pose, antennas: Antennas, passes: int) -> float:
-    """Return the range rate of another UAV [m/s]; 0 outside the field of view (of either end, for a
-    line of sight)."""
+def _closing(own: Pose, other: Pose, ends: list[Antennas]) -> float:
+    """Return the range rate of another UAV [m/s]; 0 outside the field of view of the antennas at
+    the one end, or at both ends."""
     line = other.position - own.position
     line = line / np.linalg.norm(line)
-    seen = antennas.in_view(own.to_body(line)) and (
-        passes == 2 or antennas.in_view(other.to_body(-line))
-    )
+    towards = own.to_body(line), other.to_body(-line)
+    seen = all(end.in_view(u) for end, u in zip(ends, towards, strict=False))
     return float((other.velocity - own.velocity) @ line) if seen else 0.0
 
 
 def warn_of_interference(
     swarm: Swarm,
     timetable: Timetable,
-    antennas: Antennas,
+    arrays: Arrays,
     city: CityMesh,
-    budget: tuple[float, Callable[[dict[str, Pose], Link], float]],
+    budget: tuple[Mapping[str, float], Callable[[dict[str, Pose], Link], float]],
 ) -> None:
     """Warn of plain radars that receive each other over the noise of a sample: the simulation
     assumes one clock and separate slots.
@@ -268,10 +271,10 @@ def warn_of_interference(
     Parameters
     ----------
     city : whose surfaces block direct paths
-    budget : amplitude of one transmit antenna [sqrt(W)], and the noise power of a sample by poses
-        and link [W]
+    budget : amplitude of one transmit antenna of each terminal [sqrt(W)], and the noise power of a
+        sample by poses and link [W]
     """
-    w, (amplitude, noise) = timetable.waveform, budget
+    w, (amplitudes, noise) = timetable.waveform, budget
     if w.carries_data:
         return
     # of each path: power over the noise, power [W], distance [m], frame
@@ -279,7 +282,8 @@ def warn_of_interference(
     for frame in np.unique(np.linspace(0, timetable.frames - 1, ALIAS_EPOCHS).round().astype(int)):
         poses = swarm.poses(timetable.epoch(int(frame)))
         for tx, rx in itertools.permutations(timetable.with_role("active", int(frame)), 2):
-            power = amplitude**2 * _direct_gain(poses[tx], poses[rx], antennas, w)
+            sender, receiver = ((poses[name], arrays.of(name)) for name in (tx, rx))
+            power = amplitudes[tx] ** 2 * _direct_gain(sender, receiver, w)
             over = power / noise(poses, Link(rx, rx))
             if over > max(1.0, most[tx, rx][0] if (tx, rx) in most else 0.0):
                 ends = np.array([poses[tx].position, poses[rx].position])
@@ -301,13 +305,16 @@ def warn_of_interference(
     )
 
 
-def _direct_gain(tx: Pose, rx: Pose, antennas: Antennas, waveform: Waveform) -> float:
+def _direct_gain(
+    sender: tuple[Pose, Antennas], receiver: tuple[Pose, Antennas], waveform: Waveform
+) -> float:
     """Return the received power of a direct path over the power of one transmit antenna: Friis'
     equation with the patterns of both elements, times the antennas that send at once."""
+    (tx, sending), (rx, receiving) = sender, receiver
     polyline = rx.position - tx.position
     distance = float(np.linalg.norm(polyline))
-    sent = float(antennas.element_gain(tx.to_body(polyline / distance)))
-    received = float(antennas.element_gain(rx.to_body(-polyline / distance)))
+    sent = float(sending.element_gain(tx.to_body(polyline / distance)))
+    received = float(receiving.element_gain(rx.to_body(-polyline / distance)))
     at_once = waveform.num_tx if waveform.bands > 1 else 1
     return at_once * sent * received * (waveform.wavelength / (4 * np.pi * distance)) ** 2
 

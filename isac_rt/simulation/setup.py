@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from isac_rt.frame.antennas import Antennas, antennas_of
+from isac_rt.frame.antennas import Antennas, Arrays, antennas_of
 from isac_rt.frame.clock import Clock
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.level import (
@@ -171,7 +171,7 @@ class Frame:
         """Return the receive array and the reference chirps of a link's receiver."""
         s = self._setup
         start = s.timetable.start_time(self.number, link.tx)
-        return ReceiveArray(self.poses[link.rx], s.antennas), Reference(start)
+        return ReceiveArray(self.poses[link.rx], s.arrays.of(link.rx)), Reference(start)
 
     def _noise(self, link: Link) -> WhiteNoise:
         seed = self._setup.scenario.seed
@@ -195,7 +195,7 @@ class Setup:
 
     scenario: Scenario
     waveform: Waveform
-    antennas: Antennas
+    arrays: Arrays
     swarm: Swarm
     city: CityMesh
     believed_city: CityMesh
@@ -213,7 +213,7 @@ class Setup:
     """What `prepare` took."""
 
     def with_antennas(self, antennas: Antennas) -> Setup:
-        """Return the set-up with other antennas and newly traced paths.
+        """Return the set-up with other antennas at every terminal and newly traced paths.
 
         Raises
         ------
@@ -224,17 +224,24 @@ class Setup:
                 f"the waveform is of {self.waveform.num_tx} transmit antennas, the array has "
                 f"{antennas.num_tx}; prepare a scenario with this array"
             )
-        free = replace(self.reference, antennas=antennas)
-        plan = replace(self.plan, antennas=antennas)
+        arrays = Arrays(antennas)
+        free = replace(self.reference, arrays=arrays)
+        plan = replace(self.plan, arrays=arrays)
         floor = noise_floor(self.scenario, plan, free)
         return replace(
             self,
-            antennas=antennas,
+            arrays=arrays,
             reference=free,
             plan=plan,
             propagation=_maker(self.scenario, plan, free, self.city, floor)(),
             expectation=_expectation_of(self.scenario, plan, free, self.believed_city),
         )
+
+    @property
+    def antennas(self) -> Antennas:
+        """Antennas of the terminals that state none of their own; `arrays.at(link)` are those of a
+        link."""
+        return self.arrays.common
 
     @property
     def schedule(self) -> Schedule:
@@ -251,7 +258,7 @@ class Setup:
         """Hardware of each terminal (`isac_rt.extensions.hardware.front_end.FrontEnd`)."""
         s, make = self.scenario, extension("front_end")
         return {
-            name: make(s.front_end_of(name), self.waveform, self.antennas, s.seed, name)
+            name: make(s.front_end_of(name), self.waveform, self.arrays.of(name), s.seed, name)
             for name, uav in s.swarm.items()
             if uav.role != "target"
         }
@@ -268,7 +275,8 @@ class Setup:
         if file is None:
             return None
         found = extension("calibration")(file)
-        found.check_size(self.antennas.num_rx, self.antennas.num_tx)
+        for antennas in self.arrays:
+            found.check_size(antennas.num_rx, antennas.num_tx)
         return found
 
     def calibrated(self, cube: IFCube) -> IFCube:
@@ -303,7 +311,7 @@ class Setup:
     def coverage(self) -> Coverage:
         """Coverage of the links, and the UAVs outside it."""
         s = self.scenario
-        return coverage(self.swarm, self.timetable, self.antennas, s.receivers, s.schedule)
+        return coverage(self.swarm, self.timetable, self.arrays, s.receivers, s.schedule)
 
     def noise_power(self, poses: dict[str, Pose], link: Link) -> float:
         """E|n|^2 of a sample at the link's receiver [W], Gaussian clutter included."""
@@ -356,10 +364,10 @@ class Setup:
         return Transmission(
             name=active,
             pose=pose,
-            antennas=self.antennas,
+            antennas=self.arrays.of(active),
             schedule=self.schedule if schedule is None else schedule,
             payload=self.timetable.payload(active, frame, schedule),
-            amplitude=self.plan.amplitude,
+            amplitude=self.plan.amplitudes[active],
             first_block=self.timetable.first_block(active, frame),
             codes=codes_of(self.waveform),
         )
@@ -371,7 +379,7 @@ class Setup:
         for name in (link.tx for link in self.timetable.links(frame) if link.own):
             when = self.timetable.epoch(frame, name)
             pose = self.believed(name, self.swarm.trajectories[name].pose(when))
-            out[name] = self.expectation.clutter(name, pose, when, self.plan.amplitude)
+            out[name] = self.expectation.clutter(name, pose, when, self.plan.amplitudes[name])
         return out
 
 
@@ -387,17 +395,11 @@ def link_budgets(setup: Setup) -> list[LinkBudget]:
         name = setup.reference.strongest_target(poses, tx) if link.own else rx
         distance = float(np.linalg.norm(poses[name].position - poses[tx].position))
         what = f"echo of {name}" if link.own else "line of sight"
-        rows.append(
-            link_budget(
-                link,
-                what,
-                distance,
-                amplitude,
-                setup.scenario.noise,
-                setup.waveform,
-                setup.antennas,
-            )
-        )
+        sent, received = (setup.scenario.noise_of(name) for name in link)
+        power = (transmit_amplitude(sent) * amplitude) ** 2
+        noise = noise_power(received, setup.waveform, amplitude)
+        antennas = setup.arrays.at(link)
+        rows.append(link_budget(link, what, distance, (power, noise), setup.waveform, antennas))
     return rows
 
 
@@ -423,14 +425,14 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
     """
     begin = Seconds.of_process()
     waveform = waveform_of(scenario.radio, scenario.array, scenario.modulation)
-    antennas = antennas_of(scenario.array, waveform)
+    arrays = arrays_of(scenario, waveform)
     swarm = swarm_of(scenario)
     schedule = schedule_of(scenario.schedule, waveform, generator(scenario.seed, "schedule"))
     timetable = timetable_of(scenario, waveform, schedule)
-    check_memory(antennas, timetable)
+    check_memory(arrays, timetable)
     check_flights(swarm, timetable)
     check_reference(scenario.noise, scenario.clutter, swarm, timetable)
-    plan = plan_of(scenario, antennas, timetable, swarm)
+    plan = plan_of(scenario, arrays, timetable, swarm)
     # the blocks, and with them the reach, are found out in the run where links are established
     reach = plan.mesh_radius(swarm.middle)
     radius = np.inf if scenario.access.establish or plan.whole_mesh else reach
@@ -442,12 +444,10 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
     check_passage(swarm, timetable, whole)
     if scenario.propagation.model == "ray_traced":
         check_reach(scenario.city, whole, reach)
-    warn_of_aliases(
-        swarm, timetable, antennas, scenario.receivers.velocity_method, scenario.schedule
-    )
-    free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
+    warn_of_aliases(swarm, timetable, arrays, scenario.receivers.velocity_method, scenario.schedule)
+    free = FreeSpace(swarm.uavs, arrays, waveform.wavelength, scenario.seed)
     level = partial(_noise_power, scenario, waveform, free)
-    warn_of_interference(swarm, timetable, antennas, whole, (plan.amplitude, level))
+    warn_of_interference(swarm, timetable, arrays, whole, (plan.amplitudes, level))
     floor = noise_floor(scenario, plan, free)
     make = _maker(scenario, plan, free, city, floor)
     if store is None or scenario.propagation.model != "ray_traced":
@@ -460,7 +460,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
     setup = Setup(
         scenario,
         waveform,
-        antennas,
+        arrays,
         swarm,
         city,
         believed,
@@ -497,7 +497,7 @@ def _expectation_of(
     floor = _floor_of(scenario, plan, free, own)
     make = extension("expected_clutter")
     level = scenario.belief.level_db
-    found: ClutterExpectation = make(*about, plan.antennas, scenario.seed, floor, level)
+    found: ClutterExpectation = make(*about, plan.arrays, scenario.seed, floor, level)
     return found
 
 
@@ -517,7 +517,7 @@ def _noise_power(
     poses: dict[str, Pose],
     link: Link,
 ) -> float:
-    noise, rise = scenario.noise, scenario.clutter.noise_rise
+    noise, rise = scenario.noise_of(link.rx), scenario.clutter.noise_rise
     if noise.model == "link_budget":
         return rise * thermal_noise_power(noise, waveform)
     amplitude = reference.reference_amplitude(poses, link)
@@ -546,7 +546,7 @@ def _floor_of(
     over_noise = {}
     for link in links:
         by_beam = any(receivers.looks_by_beam(link.own) for receivers in sets)
-        gain = plan.cell_noise_gain() * (BY_BEAM if by_beam else 1.0)
+        gain = plan.cell_noise_gain(link.tx) * (BY_BEAM if by_beam else 1.0)
         over_noise[link] = np.array(
             [
                 gain / _noise_power(scenario, plan.waveform, reference, pose, link)
@@ -555,7 +555,7 @@ def _floor_of(
                 for frame, pose in zip(frames, poses, strict=True)
             ]
         )
-    return NoiseFloor(plan.waveform, plan.antennas, plan.longest_delay, times, over_noise)
+    return NoiseFloor(plan.waveform, plan.arrays, plan.longest_delay, times, over_noise)
 
 
 def timetable_of(scenario: Scenario, waveform: Waveform, schedule: Schedule) -> Timetable:
@@ -574,15 +574,21 @@ def timetable_of(scenario: Scenario, waveform: Waveform, schedule: Schedule) -> 
     )
 
 
-def plan_of(scenario: Scenario, antennas: Antennas, timetable: Timetable, swarm: Swarm) -> Plan:
+def arrays_of(scenario: Scenario, waveform: Waveform) -> Arrays:
+    """Build the antennas of a scenario's terminals."""
+    own = {n: antennas_of(u.array, waveform) for n, u in scenario.swarm.items() if u.array}
+    return Arrays(antennas_of(scenario.array, waveform), own)
+
+
+def plan_of(scenario: Scenario, arrays: Arrays, timetable: Timetable, swarm: Swarm) -> Plan:
     """Build the plan of a scenario."""
     return Plan(
         scenario.accuracy,
         scenario.propagation,
-        antennas,
+        arrays,
         timetable,
         swarm,
-        transmit_amplitude(scenario.noise),
+        {name: transmit_amplitude(scenario.noise_of(name)) for name in swarm.terminals},
     )
 
 
@@ -621,8 +627,7 @@ def city_of(scenario: Scenario, radius: float = np.inf) -> CityMesh:
 def propagation_in(city: CityMesh, scenario: Scenario, sample_spacing: float = 0.0) -> Propagation:
     """Return the scenario's propagation model in any city."""
     waveform, swarm = waveform_of(scenario.radio, scenario.array), swarm_of(scenario)
-    antennas = antennas_of(scenario.array, waveform)
-    free = FreeSpace(swarm.uavs, antennas, waveform.wavelength, scenario.seed)
+    free = FreeSpace(swarm.uavs, arrays_of(scenario, waveform), waveform.wavelength, scenario.seed)
     settings = scenario.propagation, scenario.clutter
     return make_propagation(Ground(*settings, swarm, city, waveform, free, sample_spacing))
 

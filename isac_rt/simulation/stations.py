@@ -41,11 +41,11 @@ def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = N
     """
     s = settings or setup.scenario
     equipment = extension("equipment")(setup, link, s)
-    known = setup.waveform, setup.antennas, s.receivers, s.tracking
+    known = setup.waveform, setup.arrays.at(link), s.receivers, s.tracking
     if link.own:
         return ActiveTerminal(*known, equipment)
     order, groups = setup.scenario.modulation.dpsk_order, setup.timetable.groups(link)
-    return PassiveTerminal(*known, order, setup.plan.amplitude, groups, equipment)
+    return PassiveTerminal(*known, order, setup.plan.amplitudes[link.tx], groups, equipment)
 
 
 def terminal_with(setup: Setup, link: Link, made: Terminal | Receiver) -> Terminal:
@@ -72,7 +72,7 @@ class Station:
 
     def __init__(self, setup: Setup, link: Link, terminal: Terminal, receivers: Receivers) -> None:
         self.link, self.setup, self.terminal = link, setup, terminal
-        self.scorer = Scorer(link, setup.antennas, setup.swarm, setup.timetable, receivers)
+        self.scorer = Scorer(link, setup.arrays, setup.swarm, setup.timetable, receivers)
         self.receivers = receivers
         self.feedback = {"answers": 0, "corrections": 0}
         self.seconds = 0.0
@@ -149,7 +149,7 @@ class Station:
             received.reception,
             received.tracks,
             at_active.tracks,
-            s.antennas.num_rx,
+            s.arrays.of(self.link.rx).num_rx,
             s.connections.offset_std(self.link, when),
             s.waveform,
         )
@@ -228,7 +228,7 @@ class StationSet:
             Recorder(timetable, [state.name.lower() for state in TerminalState]),
             setup.swarm,
             None if cooperation == "none" else extension("cooperation")(setup),
-            SwarmScorer(timetable, setup.antennas),
+            SwarmScorer(timetable, setup.arrays),
         )
 
     def reports(self, link: Link, frame: int) -> list[ReportedUav]:

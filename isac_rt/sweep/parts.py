@@ -65,7 +65,7 @@ class FrameParts:
             yield "samples", cube.samples
         if not keep & {*TRANSFORMED, "boxes", "mask"}:
             return
-        known = Known.of(cube, payload, self._setup.antennas, link.passes)
+        known = Known.of(cube, payload, self._setup.arrays.at(link), link.passes)
         if keep & {*TRANSFORMED}:
             spectra, decoded = known.decoded(clean_spectrum(cube, known))
             yield from _transformed(channel_maps(spectra, decoded), decoded, keep)
@@ -158,7 +158,7 @@ def labels(setup: Setup, frame: Frame, link: Link) -> tuple[np.ndarray, np.ndarr
     column = np.mod(rate / cell + columns // 2, columns)
     noise, groups = frame.noise_power(link), w.num_groups
     receivers = setup.scenario.receivers
-    gain = Sensitivity.of(w, setup.antennas, receivers, sent, noise, groups, link.own).cell
+    gain = Sensitivity.of(w, setup.arrays.at(link), receivers, sent, noise, groups, link.own).cell
     names = list(frame.poses)
     owner, power = owners(paths.kind, paths.target, paths, names), paths.power * gain
     direction = frame.poses[link.rx].to_body(paths.arrival)[:, 0]

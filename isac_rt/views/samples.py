@@ -93,7 +93,7 @@ def write_samples(
             frame = setup.frame(number)
             for link in (one for one in links if one in received[number]):
                 name = str(setup.timetable.labels[link]).replace("->", "_to_")
-                one = Recorded(name, number, frame.samples(link), setup.antennas)
+                one = Recorded(name, number, frame.samples(link), setup.arrays.at(link))
                 if link not in writers:
                     count = sum(link in there for there in received.values())
                     writers[link] = _WRITERS[form](staged.stage, one, count)

@@ -35,7 +35,11 @@ def test_budget_of_the_papers_link():
     noise = Noise(tx_power_dbm=10.0, noise_figure_db=10.0)
     antennas = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=1e-3)
     amplitude = WAVEFORM.wavelength / (4 * np.pi * 11.31)
-    row = link_budget(("AT", "PT1"), "line of sight", 11.31, amplitude, noise, WAVEFORM, antennas)
+    powers = (
+        (transmit_amplitude(noise) * amplitude) ** 2,
+        noise_power(noise, WAVEFORM, amplitude),
+    )
+    row = link_budget(("AT", "PT1"), "line of sight", 11.31, powers, WAVEFORM, antennas)
     loss = 20 * np.log10(4 * np.pi * 11.31 / WAVEFORM.wavelength)
     assert row.link == "AT->PT1"
     assert row.received_dbm == pytest.approx(10 - loss, abs=1e-9)

@@ -16,7 +16,7 @@ def test_virtual_positions_are_the_sums_about_both_centroids():
     rx = [(-1, -2), (1, 2)]
     by_hand = [(t[0] + r[0], 0, t[1] + r[1]) for t in tx for r in rx]
     assert a.virtual_positions == pytest.approx(np.array(by_hand), abs=1e-15)
-    assert (a.num_tx, a.num_rx, a.is_l) == (3, 2, False)
+    assert (a.num_tx, a.num_rx) == (3, 2)
     assert a.observes(2) == (True, True)
 
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from isac_rt.document import ScenarioWarning
-from isac_rt.frame.antennas import Antennas, antennas_of, azimuth_elevation, unit_vector
+from isac_rt.frame.antennas import Antennas, Arrays, antennas_of, azimuth_elevation, unit_vector
+from isac_rt.frame.link import Link
 from isac_rt.frame.settings import Array
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.settings import Propagation
@@ -136,7 +137,7 @@ def test_a_body_is_in_view_of_both_ends(own, active):
     by_own, by_active = LOOKS["own"][own], LOOKS["active"][active]
 
     def within(receiver: str, body: str) -> bool:
-        return within_view(ANTENNAS, poses[receiver], poses["active"], poses[body])
+        return within_view(Arrays(ANTENNAS), Link("active", receiver), poses, body)
 
     assert within("own", "body") is ("body" in by_own and "body" in by_active)
     assert within("own", "active") is ("active" in by_own and "own" in by_active)

@@ -20,7 +20,7 @@ from truths.truths import lambertian_wall, slab_reflection
 from isac_rt import scenario
 from isac_rt.extensions.city_receivers.covariance import Bucketed
 from isac_rt.extensions.city_receivers.power import TAPER, Taper, expected_power
-from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.antennas import Arrays, antennas_of
 from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import waveform_of
@@ -437,7 +437,7 @@ def expectation(
     s = scenario.Scenario.model_validate(tree)
     w = waveform_of(s.radio, s.array)
     swarm, antennas = swarm_of(s), antennas_of(s.array, w)
-    copy = make_expectation(s.clutter, swarm, city, w, antennas, s.seed, None, level_db)
+    copy = make_expectation(s.clutter, swarm, city, w, Arrays(antennas), s.seed, None, level_db)
     return copy, swarm.poses(0.0)["A"]
 
 

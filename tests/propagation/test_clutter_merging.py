@@ -250,8 +250,8 @@ def over_noise(setup: Setup, link: Link, frame: int, *, whole: bool) -> tuple[np
     ]
     state = LinkState(link, epoch, *local)
     seen = (field.whole() if whole else field).seen(state)
-    level = setup.plan.cell_noise_gain() / setup.noise_power(poses, link)
-    power = level * (seen.magnitude * state.elements(setup.antennas, seen)) ** 2
+    level = setup.plan.cell_noise_gain(link.tx) / setup.noise_power(poses, link)
+    power = level * (seen.magnitude * state.elements(setup.arrays, seen)) ** 2
     motion = seen.length / SPEED_OF_LIGHT, seen.rate / SPEED_OF_LIGHT
     return power, seen.length, resolution_cell(setup.waveform, *motion)
 
@@ -360,7 +360,7 @@ def test_what_no_element_sends_or_hears_is_left_out_and_nothing_else():
             heard = []
             for field in fields:
                 seen = field.seen(state)
-                power = (seen.magnitude * state.elements(some.antennas, seen)) ** 2
+                power = (seen.magnitude * state.elements(some.arrays, seen)) ** 2
                 lit = np.flatnonzero(power)
                 order = np.lexsort(field.cells.points[seen.index[lit]].T)
                 heard.append((field.cells.points[seen.index[lit]][order], power[lit][order]))

@@ -13,7 +13,7 @@ from truths.truths import WAVELENGTH, chain_length
 
 from isac_rt import scenario as tree
 from isac_rt.document import ScenarioError, ScenarioWarning
-from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.antennas import Arrays, antennas_of
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.segments.clearance import CLEARANCE, ClearanceWarning
@@ -272,7 +272,7 @@ def aliases(s):
         warn_of_aliases(
             swarm_of(s),
             timetable_of(s, w, np.zeros((3, 120), int)),
-            antennas_of(s.array, w),
+            Arrays(antennas_of(s.array, w)),
             s.receivers.velocity_method,
             s.array.schedule,
         )

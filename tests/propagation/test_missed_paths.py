@@ -32,7 +32,7 @@ def strongest_missed(setup: Setup, frames: list[int], rays: int) -> float:
         poses, found = setup.find(number)
         truth = solver.trace(poses, setup.timetable.epoch(number), list(found)).paths
         for link, paths in truth.items():
-            noise = setup.noise_power(poses, link) / setup.plan.cell_noise_gain()
+            noise = setup.noise_power(poses, link) / setup.plan.cell_noise_gain(link.tx)
             missed = ~present(paths, found[link]) & (paths.delay <= setup.plan.longest_delay)
             most = max(most, float((paths.power[missed] / noise).max(initial=0.0)))
     return 10 * np.log10(most) if most else -np.inf
@@ -77,7 +77,7 @@ def test_the_estimate_is_that_of_two_searches(monkeypatch):
             if epoch not in known:
                 known[epoch] = tracer.trace(poses, epoch, links).paths
             for link, found in known[epoch].items():
-                noise = setup.noise_power(poses, link) / setup.plan.cell_noise_gain()
+                noise = setup.noise_power(poses, link) / setup.plan.cell_noise_gain(link.tx)
                 strong = found.power > 0.1 * noise
                 matters += int(strong.sum())
                 shows += int((found.power > 1e-4 * noise).sum())
@@ -111,7 +111,7 @@ def test_fewer_rays_miss_about_as_much_as_is_estimated(scene, rays, every):
     for number in frames:
         poses, found = few.find(number)
         for link, paths in many.find(number)[1].items():
-            noise = many.noise_power(poses, link) / many.plan.cell_noise_gain()
+            noise = many.noise_power(poses, link) / many.plan.cell_noise_gain(link.tx)
             over = paths.select(paths.power > 0.1 * noise)
             missed += int((~present(over, found[link])).sum())
     estimate = missed_per_frame(few, frames) * len(frames)

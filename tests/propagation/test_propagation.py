@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, Arrays
 from isac_rt.frame.link import Link
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.pathset import PathKind
@@ -292,7 +292,7 @@ UAVS = {
 
 
 def free_space(uavs=UAVS, **changes) -> FreeSpace:
-    return FreeSpace(uavs, antennas(**changes), LAMBDA, 1)
+    return FreeSpace(uavs, Arrays(antennas(**changes)), LAMBDA, 1)
 
 
 def element(p: Pose, towards: np.ndarray, gain=3.7) -> float:

@@ -10,7 +10,7 @@ import pytest
 from truths import stage
 
 from isac_rt import scenario
-from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.antennas import Arrays, antennas_of
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.pathset import PathKind, PathSet
@@ -304,7 +304,9 @@ def test_empty_scene_is_free_space():
     poses = stage.swarm((1.37, -2.21, 11.3), (23.9, 17.3, 8.77), (9.7, 31.1, 14.9))
     model, s = stage.tracer(empty_city("none", np.array([3.0, 4.0, 5.0]))), stage.scenario()
     closed = (
-        FreeSpace(s.swarm, antennas_of(s.array, waveform_of(s.radio, s.array)), LAMBDA, s.seed)
+        FreeSpace(
+            s.swarm, Arrays(antennas_of(s.array, waveform_of(s.radio, s.array))), LAMBDA, s.seed
+        )
         .trace(poses, 0.25, LINKS)
         .paths
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, Arrays
 from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
@@ -62,13 +62,13 @@ def test_each_end_weighs_by_its_own_axes(own):
     state = LinkState(Link("A", "A" if own else "B"), 0.0, SENDER, end)
     arrival = 4 * max(way.arrival[0] @ end.rotation[:, 1], 0)
     assert arrival == pytest.approx(0.0 if own else 3.2)
-    assert state.elements(COSINE, way)[0] == pytest.approx(np.sqrt(3.2 * arrival))
+    assert state.elements(Arrays(COSINE), way)[0] == pytest.approx(np.sqrt(3.2 * arrival))
     there = segments()[0]
     bent = ScatterPaths.over(there, segment((29.0, -7.0, 1.1), unit(0, 0.6, 0.8), unit(0, 1, 0)))
     straight = ScatterPaths.over(there, there)
     if own:
-        assert state.elements(COSINE, bent)[0] == pytest.approx(np.sqrt(3.2 * 2.4))
-        assert state.elements(COSINE, straight)[0] == pytest.approx(3.2)
+        assert state.elements(Arrays(COSINE), bent)[0] == pytest.approx(np.sqrt(3.2 * 2.4))
+        assert state.elements(Arrays(COSINE), straight)[0] == pytest.approx(3.2)
 
 
 def test_paths_are_their_ways_over_the_speed_of_light():

@@ -8,7 +8,8 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from isac_rt.frame.antennas import Antennas, resolutions
+from isac_rt.frame.antennas import Antennas, Arrays, resolutions
+from isac_rt.frame.link import Link
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import Waveform
@@ -181,16 +182,22 @@ def test_both_fields_of_view_count():
     between, behind_at, behind_pt = (
         pose([x, y, 9], [0, 0, 0]) for x, y in ((1, 20), (1, -20), (1, 70))
     )
-    assert within_view(ANTENNAS, pt, at, between)
-    assert not within_view(ANTENNAS, pt, at, behind_at)
-    assert not within_view(ANTENNAS, pt, at, behind_pt)
-    assert within_view(ANTENNAS, at, at, between) and within_view(ANTENNAS, at, at, behind_pt)
-    assert not within_view(ANTENNAS, at, at, behind_at)
-    assert within_view(ANTENNAS, pt, at, at)
+    places = {"between": between, "behind_at": behind_at, "behind_pt": behind_pt}
     away = pose([0, 0, 9], [0, 0, 0], (0, -1, 0))
-    assert not within_view(ANTENNAS, pt, away, away)
     turned = pose([3, 40, 9], [0, 0, 0])
-    assert not within_view(ANTENNAS, turned, at, at)
+
+    def seen(receiver: str, name: str, at: Pose = at, pt: Pose = pt) -> bool:
+        poses = {"at": at, "pt": pt, **places}
+        return within_view(Arrays(ANTENNAS), Link("at", receiver), poses, name)
+
+    assert seen("pt", "between")
+    assert not seen("pt", "behind_at")
+    assert not seen("pt", "behind_pt")
+    assert seen("at", "between") and seen("at", "behind_pt")
+    assert not seen("at", "behind_at")
+    assert seen("pt", "at")
+    assert not seen("pt", "at", at=away)
+    assert not seen("pt", "at", pt=turned)
 
 
 def test_binomial_interval():

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.antennas import Arrays, antennas_of
 from isac_rt.frame.cube import Transmission
 from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import conventional_schedule
@@ -148,7 +148,7 @@ def scored(scorer, frame, paths, points=(), tracks=(), **reception):
 
 
 def scorer(receiver: str) -> Scorer:
-    return Scorer(Link("AT", receiver), ANTENNAS, SWARM, TIMETABLE, Receivers())
+    return Scorer(Link("AT", receiver), Arrays(ANTENNAS), SWARM, TIMETABLE, Receivers())
 
 
 def read(frame: int, wrong: float = 0.0) -> dict:
@@ -335,7 +335,7 @@ def test_targets_are_scored_without_the_terminals():
     assert (record.uavs.clutter_free[[0, 2]] > 0.99).all()
     roles = TIMETABLE.first_roles
     alone = replace(TIMETABLE, first_roles=roles | {"U1": "passive", "U2": "passive"})
-    judge = Scorer(Link("AT", "AT"), ANTENNAS, SWARM, alone, Receivers())
+    judge = Scorer(Link("AT", "AT"), Arrays(ANTENNAS), SWARM, alone, Receivers())
     record = scored(judge, DATA, rows, [], tracks)
     assert not record.uavs.cooperative.any()
     assert record.gospa[1:] == pytest.approx((4.09, 0.0, 0.0))
@@ -394,7 +394,7 @@ def test_what_is_outside_the_view_or_bent_is_not_asked_for():
     with a path counts wherever it is; bent paths count."""
     rows = [path_of("AT", "U1", DATA, 30.0)]
     narrow = replace(ANTENNAS, half_view=0.05)
-    judge = Scorer(Link("AT", "AT"), narrow, SWARM, TIMETABLE, Receivers())
+    judge = Scorer(Link("AT", "AT"), Arrays(narrow), SWARM, TIMETABLE, Receivers())
     record = scored(judge, DATA, rows)
     assert (record.uavs.in_view[0], record.uavs.occluded[0], record.uavs.loss[0]) == (
         False,
@@ -435,7 +435,7 @@ def test_streams_and_blocks():
     table = timetable_of(
         SCENARIO.model_copy(update={"swarm": uavs, "modulation": streams}), W, TIMETABLE.schedule
     )
-    judge = Scorer(Link("AT", "PT1"), ANTENNAS, SWARM, table, Receivers())
+    judge = Scorer(Link("AT", "PT1"), Arrays(ANTENNAS), SWARM, table, Receivers())
     sight = {f: [path_of("PT1", "AT", f, 3.0)] for f in (0, DATA)}
     found = {f: scored(judge, f, paths) for f, paths in sight.items()}
     assert found[0].uavs.target_snr[1] == pytest.approx(9 * MATCHED)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.antennas import Arrays, antennas_of
 from isac_rt.frame.link import Link
 from isac_rt.frame.schedule import conventional_schedule
 from isac_rt.frame.waveform import waveform_of
@@ -42,7 +42,7 @@ def scorer():
     scenario = Scenario(name="by_hand", frames=20, swarm=swarm)
     w = waveform_of(scenario.radio, scenario.array)
     schedule = conventional_schedule(w.num_groups, w.num_chirps, w.num_tx)
-    return SwarmScorer(timetable_of(scenario, w, schedule), antennas_of(scenario.array, w))
+    return SwarmScorer(timetable_of(scenario, w, schedule), Arrays(antennas_of(scenario.array, w)))
 
 
 def observers(hits=()):

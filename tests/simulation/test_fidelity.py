@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.antennas import Arrays, antennas_of
 from isac_rt.frame.schedule import schedule_of
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, waveform_of
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
@@ -38,7 +38,7 @@ def plan_of(scene: str = "paper_swarm_consistent.yaml", *overrides: str) -> Plan
     s = load(SCENES / scene, overrides)
     w = waveform_of(s.radio, s.array)
     timetable = timetable_of(s, w, schedule_of(s.array.schedule, w, generator(s.seed, "schedule")))
-    return plan_of_scenario(s, antennas_of(s.array, w), timetable, swarm_of(s))
+    return plan_of_scenario(s, Arrays(antennas_of(s.array, w)), timetable, swarm_of(s))
 
 
 def some_paths(count: int, seed: int, **changes) -> PathSet:
@@ -69,7 +69,7 @@ def test_a_plane_wavefront_errs_by_no_more_than_its_bound():
     the plane wave. The bound holds everywhere and is within ten of the truth in nine paths of ten.
     Planted bug: r for r^2 in the bound, or the radius squared."""
     plan = plan_of()
-    a = plan.antennas
+    a = plan.arrays.common
     paths = some_paths(400, 7)
     truth = np.zeros(len(paths))
     for positions, direction, radius in (
@@ -91,7 +91,7 @@ def test_a_line_of_sight_seen_plane_errs_by_no_more_than_its_bound():
     """Truth: the distance of every transmit element from every receive element. Planted bug: the
     joint term left out."""
     plan = plan_of()
-    a = plan.antennas
+    a = plan.arrays.common
     rng = np.random.default_rng(11)
     paths = some_paths(300, 11, kind=PathKind.LINE_OF_SIGHT)
     length = rng.uniform(2.0, 80.0, len(paths))
@@ -320,7 +320,8 @@ def test_approximations_go_where_their_bounds_allow_and_nowhere_else():
     plane, straight = np.isinf(kept.rx_radius), kept.delay_accel == 0
     assert 0 < plane.sum() < len(kept)
     assert 0 < straight.sum() < len(kept)
-    assert np.array_equal(plane, plane_bound(paths, plan.antennas, plan.waveform) <= 0.0155)
+    antennas = plan.arrays.at(paths.link)
+    assert np.array_equal(plane, plane_bound(paths, antennas, plan.waveform) <= 0.0155)
     assert np.array_equal(straight, straight_bound(paths, plan.waveform) <= 0.0155)
     assert (use.plane, use.straight) == (plane.sum(), straight.sum())
     assert use.plane_error <= 0.0155 >= use.straight_error

@@ -82,8 +82,8 @@ def test_a_wall_between_radars_keeps_them_apart():
         faces=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
         face_material=np.zeros(2, np.int16),
     )
-    given = setup.swarm, setup.timetable, setup.antennas
-    budget = setup.plan.amplitude, setup.noise_power
+    given = setup.swarm, setup.timetable, setup.arrays
+    budget = setup.plan.amplitudes, setup.noise_power
     with pytest.warns(ScenarioWarning, match="arrive at"):
         warn_of_interference(*given, empty_city("none", np.zeros(3)), budget)
     with warnings.catch_warnings():

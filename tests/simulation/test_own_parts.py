@@ -71,7 +71,7 @@ def test_other_antennas_find_other_paths():
     for link in (("AT", "AT"), ("AT", "PT")):
         before, after = (s.frame(0).paths[link] for s in (setup, louder))
         assert after.gain == pytest.approx(4 * before.gain)
-    assert louder.plan.antennas is louder.antennas
+    assert louder.plan.arrays is louder.arrays
     row = setup.with_antennas(
         Antennas.placed(setup.antennas.tx_positions[:, [0, 2]], [(0, 0), (0.002, 0)])
     )

@@ -98,7 +98,7 @@ def test_a_mask_says_what_is_strongest(made):
     first path of a cell taken; clutter under the noise marked."""
     setup, link = irt.prepare(made.scenario), Link("A", "A")
     frame, cell = setup.frame(0), setup.waveform.range_cell(2)
-    level = setup.noise_power(frame.poses, link) / setup.plan.cell_noise_gain()
+    level = setup.noise_power(frame.poses, link) / setup.plan.cell_noise_gain(link.tx)
     kinds = [PathKind.TARGET, PathKind.SPECULAR, PathKind.DIFFUSE]
     paths = make_paths(
         tx="A",

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import dblquad, quad
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, Arrays
 from isac_rt.frame.level import thermal_noise_power
 from isac_rt.frame.link import Link
 from isac_rt.frame.settings import Noise
@@ -40,7 +40,7 @@ def _free(tx: str, rx: str, gain: float = 1.0):
     s = stage.scenario(traced=False)
     antennas = replace(stage.FEW, gain=gain)
     return (
-        FreeSpace(s.swarm, antennas, WAVELENGTH, s.seed)
+        FreeSpace(s.swarm, Arrays(antennas), WAVELENGTH, s.seed)
         .trace(stage.swarm(*PLACES), 0.0, [Link(tx, rx)])
         .paths[Link(tx, rx)]
     )

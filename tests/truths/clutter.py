@@ -365,7 +365,7 @@ def noise_and_merged_clutter() -> Errors:
                 columns = np.round(seen.rate / w.velocity_cell(1))[heard]
                 edges = np.arange(0, 2000) - 0.5, np.arange(-200, 201) - 0.5
                 maps.append(np.histogram2d(rows, columns, edges, weights=gain[heard])[0])
-            level = setup.plan.amplitude**2 * w.num_samples * w.num_chirps
+            level = setup.plan.amplitudes[link.tx] ** 2 * w.num_samples * w.num_chirps
             every, some = (m * level / setup.noise_power(poses, link) for m in maps)
             held = (every > 0) | (some > 0)
             off = np.abs(10 * np.log10((1 + some) / (1 + every)))[held]

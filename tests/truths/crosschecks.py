@@ -89,7 +89,7 @@ def paths_missed_in_a_city() -> float:
         epoch = setup.timetable.epoch(number)
         truth = tracer.by_sionna(CHECK_RAYS).trace(poses, epoch, list(found)).paths
         for link, paths in truth.items():
-            level = setup.noise_power(poses, link) / setup.plan.cell_noise_gain()
+            level = setup.noise_power(poses, link) / setup.plan.cell_noise_gain(link.tx)
             over = paths.select(paths.power > level * 10 ** (MATTERS_DB / 10))
             missed += int((~present(over, found[link])).sum())
     return missed

@@ -11,6 +11,7 @@ from scipy.integrate import quad
 
 from isac_rt import scenario as tree
 from isac_rt.extensions.city_files.extrude import building
+from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.link import Link
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.pathset import PathKind
@@ -58,7 +59,7 @@ def _over(planes: tuple, distances: tuple[float, ...] = (1.013, 9.87, 101.3, 997
 def _free_space(poses: dict[str, Pose], tx: str, rx: str):
     s = stage.scenario(traced=False)
     return (
-        FreeSpace(s.swarm, stage.FEW, truths.WAVELENGTH, s.seed)
+        FreeSpace(s.swarm, Arrays(stage.FEW), truths.WAVELENGTH, s.seed)
         .trace(poses, 0.0, [Link(tx, rx)])
         .paths[Link(tx, rx)]
     )

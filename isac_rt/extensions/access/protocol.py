@@ -45,7 +45,7 @@ from isac_rt.extensions.access.synchronise import (
     path_acceleration,
     round_of,
 )
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.clock import Clock
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.link import Link
@@ -79,7 +79,7 @@ class Network:
 
     Attributes
     ----------
-    waveform, antennas, schedule : public
+    waveform, arrays, schedule : public
     receivers : settings of the passive receiver
     scene : poses and paths at any time
     wishes : first block that each active terminal would like, in the order in which they join; None
@@ -87,7 +87,7 @@ class Network:
     listeners : passive terminals of each active one
     clocks : of every terminal; those left out are right
     noise_power : E|n|^2 per IF sample of every receiver [W]
-    amplitude : sqrt(transmit power) of every terminal's antenna
+    amplitudes : sqrt(transmit power) of an antenna of each terminal; 1 by default
     seed : of all randomness here
     external_clock : whether stage 2 is left out
     dpsk_order : of the data of those that have joined
@@ -95,7 +95,7 @@ class Network:
     """
 
     waveform: Waveform
-    antennas: Antennas
+    arrays: Arrays
     schedule: Schedule
     receivers: Receivers
     scene: Scene
@@ -104,7 +104,7 @@ class Network:
     noise_power: Mapping[str, float]
     seed: int
     clocks: Mapping[str, Clock] = field(default_factory=dict)
-    amplitude: float = 1.0
+    amplitudes: Mapping[str, float] = field(default_factory=dict)
     external_clock: bool = False
     dpsk_order: int = 8
     start: float = 0.0
@@ -209,10 +209,10 @@ class _Air:
         return Transmission(
             name=name,
             pose=n.scene(self.time, [])[0][name],
-            antennas=n.antennas,
+            antennas=n.arrays.of(name),
             schedule=n.schedule,
             payload=payload,
-            amplitude=n.amplitude,
+            amplitude=n.amplitudes.get(name, 1.0),
             first_block=block,
             clock_offset=0.0 if data else n.hold,
             active=active,
@@ -244,7 +244,7 @@ class _Air:
         return noisy_if_signal(
             w,
             links,
-            ReceiveArray(poses[name], n.antennas),
+            ReceiveArray(poses[name], n.arrays.of(name)),
             Reference(start, first_block, n.schedule),
             Auto(n.noise_power[name]),
             WhiteNoise(n.noise_power[name], words),
@@ -393,10 +393,10 @@ def _clock(
     return estimate_clock([first, second], acceleration)
 
 
-def _line_of_sight(air: _Air, cube: IFCube) -> Detections:
-    n = air.n
-    found = receive_passive(cube, n.antennas, n.receivers, n.dpsk_order, None, False).detections
-    return measured_alone(found, cube, n.antennas)
+def _line_of_sight(air: _Air, cube: IFCube, link: Link) -> Detections:
+    n, antennas = air.n, air.n.arrays.at(link)
+    found = receive_passive(cube, antennas, n.receivers, n.dpsk_order, None, False).detections
+    return measured_alone(found, cube, antennas)
 
 
 def _first_round(
@@ -405,7 +405,7 @@ def _first_round(
     """The active terminal's unmodulated frame at every passive one that knows where to listen."""
     sent, w, out = air.sender(at, block), air.n.waveform, {}
     for pt, first in understood.items():
-        found = _line_of_sight(air, air.received(pt, first, [sent]))
+        found = _line_of_sight(air, air.received(pt, first, [sent]), Link(at, pt))
         whole = (first - block) * w.group_spacing  # blocks by which the two grids differ
         held = air.n.hold - whole
         out[pt] = round_of(found, air.time, True, cell=w.range_cell(1), held=held)
@@ -444,7 +444,7 @@ def _second_round(
         cube = air.received(at, block, _answers(air, turn, understood, {}))
         for group, pt in turn:
             if pt in understood:
-                found = _line_of_sight(air, cube.of_groups([group]))
+                found = _line_of_sight(air, cube.of_groups([group]), Link(pt, at))
                 # it answers on its own grid, whole blocks late by the other one's, as both know
                 held = air.n.hold + (understood[pt] - block) * w.group_spacing
                 out[pt] = round_of(found, air.time, False, cell=w.range_cell(1), held=held)
@@ -484,7 +484,7 @@ def establish_links(setup: Setup, clocks: Mapping[str, Clock]) -> Establishment:
     first = setup.swarm.poses(timetable.epoch(0))
     network = Network(
         waveform=setup.waveform,
-        antennas=setup.antennas,
+        arrays=setup.arrays,
         schedule=setup.schedule,
         receivers=s.receivers,
         scene=scene,
@@ -494,7 +494,7 @@ def establish_links(setup: Setup, clocks: Mapping[str, Clock]) -> Establishment:
         | {name: setup.noise_power(first, Link(active[0], name)) for name in passive},
         seed=s.seed,
         clocks=clocks,
-        amplitude=setup.plan.amplitude,
+        amplitudes=setup.plan.amplitudes,
         external_clock=s.access.synchronisation != "two_round",
         dpsk_order=s.modulation.dpsk_order,
     )

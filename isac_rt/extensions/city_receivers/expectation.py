@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from isac_rt.extensions.two_bounces.two_bounces import TwoBounces
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.cells import Density
@@ -42,7 +42,7 @@ class MeshExpectation:
         swarm: Swarm,
         city: CityMesh,
         scene: mi.Scene,
-        antennas: Antennas,
+        arrays: Arrays,
         wavelength: float,
         seed: int,
         floor: NoiseFloor | None = None,
@@ -59,7 +59,7 @@ class MeshExpectation:
             if clutter.mirrors
             else None
         )
-        self._city, self._antennas = city, antennas
+        self._city, self._arrays = city, arrays
         self.level = 1.0  # factor of all amplitudes, of terminals that are wrong about it
 
     def __len__(self) -> int:
@@ -80,7 +80,7 @@ class MeshExpectation:
         mirrored = [] if self._two_bounces is None else self._two_bounces.seen(state)
         parts = [self._own.seen(state), *(part.seen for part in mirrored)]
         return ExpectedClutter.joined(
-            [_expected(s, amplitude * state.elements(self._antennas, s), local) for s in parts]
+            [_expected(s, amplitude * state.elements(self._arrays, s), local) for s in parts]
         )
 
     def _local(self, pose: Pose) -> Pose:
@@ -111,8 +111,9 @@ class MeshExpectation:
         mirrored = [] if self._two_bounces is None else self._two_bounces.from_places(state)
         parts = []
         for seen in [self._field.from_places(state), *(part.seen for part in mirrored)]:
-            received = self._antennas.element_gain(end.to_body(seen.arrival))
-            gain = self.level * np.sqrt(self._antennas.gain * received)
+            tx, rx = (self._arrays.of(name) for name in link)
+            received = rx.element_gain(end.to_body(seen.arrival))
+            gain = self.level * np.sqrt(tx.gain * received)
             parts.append(_expected(seen, amplitude * gain, end))
         return ExpectedClutter.joined(parts)
 
@@ -136,7 +137,7 @@ def make_expectation(
     swarm: Swarm,
     city: CityMesh,
     waveform: Waveform,
-    antennas: Antennas,
+    arrays: Arrays,
     seed: int,
     floor: NoiseFloor | None = None,
     level_db: float = 0.0,
@@ -149,7 +150,7 @@ def make_expectation(
     from isac_rt.world.city.scene import shared_scenes
 
     scene = shared_scenes(city, waveform.carrier_frequency).faces
-    about = clutter, swarm, city, scene, antennas, waveform.wavelength, seed, floor
+    about = clutter, swarm, city, scene, arrays, waveform.wavelength, seed, floor
     found = MeshExpectation(*about)
     found.level = 10 ** (level_db / 20)
     return found

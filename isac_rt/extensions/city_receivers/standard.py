@@ -82,12 +82,12 @@ def passive_terminal(
 def equipment_of(setup: Setup, link: Link, s: ReceiverSet | Scenario) -> Equipment:
     """Return what the terminal of a link has besides its receiver and its tracker."""
     walls = setup.walls if s.tracking.needs_mesh else None
-    known = setup.waveform, setup.antennas, s.receivers, s.tracking
+    known = setup.waveform, setup.arrays.at(link), s.receivers, s.tracking
     if link.own:
         return _active_equipment(*known, walls)
     clutter = None
     if s.receivers.passive_detector == "beams" and setup.expectation is not None:
-        between, amplitude = setup.expectation.between, setup.plan.amplitude
+        between, amplitude = setup.expectation.between, setup.plan.amplitudes[link.tx]
         clutter = partial(between, link, amplitude)
     order, groups = setup.scenario.modulation.dpsk_order, setup.timetable.groups(link)
     return _passive_equipment(*known, order, groups, Surroundings(walls, clutter))

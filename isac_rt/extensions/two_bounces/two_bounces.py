@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isac_rt.extensions.two_bounces.mirrors import Mirror, shown, strongest
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Arrays
 from isac_rt.propagation.clutter.field import (
     ClutterField,
     Seen,
@@ -149,7 +149,7 @@ class TwoBounces:
         return out
 
     def paths(
-        self, state: LinkState, antennas: Antennas, discs: UavDiscs | None = None
+        self, state: LinkState, arrays: Arrays, discs: UavDiscs | None = None
     ) -> list[PathSet]:
         """The link's paths, one set for each mirror and order; poses, points and UAVs in local
         coordinates."""
@@ -158,7 +158,7 @@ class TwoBounces:
             s = part.seen
             points, faces = self._chain(part, state)
             gain = cells.amplitude[s.index] * part.phasor
-            gain = gain * (s.magnitude * state.elements(antennas, s))
+            gain = gain * (s.magnitude * state.elements(arrays, s))
             out.append(
                 state.paths(s, gain, PathKind.DIFFUSE, bounces=2, points=points, faces=faces)
             )

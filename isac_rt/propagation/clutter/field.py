@@ -39,7 +39,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.kernels import propagation_field
@@ -263,7 +263,7 @@ class ClutterField:
         ]
         shadows = Shadows(scene)
         senders = [flights[name] for name in swarm.transmitters]
-        lookouts, behind = _test_positions(senders), floor is None or floor.antennas.look_back
+        lookouts, behind = _test_positions(senders), floor is None or floor.look_back
         fronts = [] if behind else [flight.fronts for flight in senders]
 
         def found() -> dict[str, Any]:
@@ -345,7 +345,7 @@ class ClutterField:
         merged = {}
         for link, over_noise in floor.over_noise.items():
             held = ever[link.tx] & ever[link.rx]
-            if not floor.antennas.look_back:
+            if not floor.look_back:
                 held &= ever_ahead(sight.flights[link.rx].fronts, cells.points)
             both = np.flatnonzero(held)
             some, visible = cells.select(both), []
@@ -362,9 +362,7 @@ class ClutterField:
         """Return a link's scatterers with the visibility `share` (N,); `level` is the power of a
         path over the noise, per power gain."""
         scatter_paths = self._paths_over(cells, share, state)
-        power = (
-            level * (scatter_paths.magnitude * state.elements(floor.antennas, scatter_paths)) ** 2
-        )
+        power = level * (scatter_paths.magnitude * state.elements(floor.arrays, scatter_paths)) ** 2
         delay = scatter_paths.length / SPEED_OF_LIGHT
         some = (power > 0) & (delay < floor.longest_delay)
         rate = scatter_paths.rate[some] / SPEED_OF_LIGHT
@@ -436,12 +434,12 @@ class ClutterField:
         advance(self.surfaces, c.points, c.face, c.area, share, self._scale, *motion, own, rows)
         return found
 
-    def paths(self, state: LinkState, antennas: Antennas, discs: UavDiscs | None = None) -> PathSet:
+    def paths(self, state: LinkState, arrays: Arrays, discs: UavDiscs | None = None) -> PathSet:
         """Return the link's paths; poses, points and UAVs in local coordinates."""
         seen, cells = self.seen(state, discs), self.of(state.link).cells
         return state.paths(
             seen,
-            cells.amplitude[seen.index] * (seen.magnitude * state.elements(antennas, seen)),
+            cells.amplitude[seen.index] * (seen.magnitude * state.elements(arrays, seen)),
             PathKind.DIFFUSE,
             bounces=1,
             points=cells.points.take(seen.index, axis=0)[:, None],

@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.clutter.cells import Cells
@@ -53,7 +53,7 @@ class NoiseFloor:
 
     Attributes
     ----------
-    waveform, antennas : of the run
+    waveform, arrays : of the run
     longest_delay : of a received path [s]
     times : (K,) increasing [s]
     over_noise : by link (K,) power of a path over the noise of a range-Doppler cell, per power
@@ -61,15 +61,20 @@ class NoiseFloor:
     """
 
     waveform: Waveform
-    antennas: Antennas
+    arrays: Arrays
     longest_delay: float
     times: np.ndarray
     over_noise: Mapping[Link, np.ndarray]
 
+    @property
+    def look_back(self) -> bool:
+        """True if elements of some terminal radiate or receive behind their plane."""
+        return any(antennas.look_back for antennas in self.arrays)
+
     def record(self) -> str:
         """Return all attributes as text, for the key of a cache."""
         links = {str(link): factors.tolist() for link, factors in self.over_noise.items()}
-        instruments = asdict(self.waveform), asdict(self.antennas)
+        instruments = asdict(self.waveform), asdict(self.arrays)
         return json.dumps([*instruments, self.longest_delay, self.times.tolist(), links])
 
 

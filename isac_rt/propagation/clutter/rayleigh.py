@@ -64,7 +64,7 @@ class RayleighClutter:
         self, model: Propagation, reference: FreeSpace, clutter: Clutter, waveform: Waveform
     ) -> None:
         self.model, self._reference, self._clutter = model, reference, clutter
-        self._waveform, self._half_view = waveform, reference.antennas.half_view
+        self._waveform = waveform
 
     def census(self) -> Census:
         """Return the census of the underlying model."""
@@ -82,9 +82,9 @@ class RayleighClutter:
         passes = paths.link.passes
         rng = generator(self._reference.seed, "rayleigh clutter", tx, rx, repr(float(epoch)))
         ranges, amplitudes = rayleigh_cells(self._clutter, self._waveform.range_cell(passes), rng)
-        departure = arrival = poses[tx].to_world(self._directions(ranges.size, rng))
+        departure = arrival = poses[tx].to_world(self._directions(tx, ranges.size, rng))
         if not own:
-            arrival = poses[rx].to_world(self._directions(ranges.size, rng))
+            arrival = poses[rx].to_world(self._directions(rx, ranges.size, rng))
         return make_paths(
             gain=self._reference.reference_amplitude(poses, paths.link) * amplitudes,
             delay=passes * ranges / SPEED_OF_LIGHT,
@@ -97,9 +97,10 @@ class RayleighClutter:
             target_names=paths.target_names,
         )
 
-    def _directions(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """(count, 3) body-frame unit vectors, uniform in azimuth and elevation within half the
+    def _directions(self, name: str, count: int, rng: np.random.Generator) -> np.ndarray:
+        """(count, 3) body-frame unit vectors, uniform in azimuth and elevation within a terminal's
         field of view."""
-        azimuth, elevation = rng.uniform(-self._half_view, self._half_view, (2, count))
+        half_view = self._reference.arrays.of(name).half_view
+        azimuth, elevation = rng.uniform(-half_view, half_view, (2, count))
         flat = np.cos(elevation)
         return np.stack([flat * np.sin(azimuth), flat * np.cos(azimuth), np.sin(elevation)], axis=1)

@@ -8,7 +8,7 @@ import pytest
 
 from isac_rt.extensions.access.ook import Message
 from isac_rt.extensions.access.protocol import Network, establish
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, Arrays
 from isac_rt.frame.clock import Clock
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
@@ -65,7 +65,7 @@ def network(**change) -> Network:
     names = ("A", "B", "P", "Q", "R")
     fields = {
         "waveform": W,
-        "antennas": Antennas(tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=0.5774 * W.wavelength),
+        "arrays": Arrays(Antennas(tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=0.5774 * W.wavelength)),
         "schedule": pseudo_random_schedule(W.num_groups, W.num_chirps, W.num_tx, rng),
         "receivers": Receivers(),
         "scene": scene_of(),

@@ -15,7 +15,7 @@ from isac_rt.extensions.access import protocol
 from isac_rt.extensions.access.ook import Message, Reading, keyed
 from isac_rt.extensions.access.protocol import Network, establish
 from isac_rt.extensions.access.synchronise import EXTERNAL
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, Arrays
 from isac_rt.frame.clock import Clock
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.schedule import pseudo_random_schedule
@@ -131,7 +131,7 @@ def network(**change) -> Network:
     rng = np.random.default_rng(7)
     fields: dict[str, Any] = {
         "waveform": W,
-        "antennas": Antennas(tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=0.002),
+        "arrays": Arrays(Antennas(tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=0.002)),
         "schedule": pseudo_random_schedule(W.num_groups, W.num_chirps, W.num_tx, rng),
         "receivers": Receivers(),
         "scene": lambda time, links: (poses, dict.fromkeys(links)),

@@ -15,7 +15,7 @@ from isac_rt.extensions.access.synchronise import (
     measured_alone,
     path_acceleration,
 )
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, Arrays
 from isac_rt.frame.clock import Clock
 from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.link import Link
@@ -210,7 +210,7 @@ def swarm(seed: int, snr_db: float) -> Network:
     clocks = {n: Clock(rng.uniform(-2e-8, 2e-8), rng.uniform(-2e-8, 2e-8)) for n in names}
     return Network(
         waveform=w,
-        antennas=Antennas(tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=0.5774 * w.wavelength),
+        arrays=Arrays(Antennas(tx_x=2, tx_z=2, rx_x=2, rx_z=2, spacing=0.5774 * w.wavelength)),
         schedule=pseudo_random_schedule(w.num_groups, w.num_chirps, w.num_tx, rng),
         receivers=Receivers(),
         scene=scene,

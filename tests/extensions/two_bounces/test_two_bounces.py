@@ -28,7 +28,7 @@ from truths.truths import slab_reflection
 
 from isac_rt import scenario
 from isac_rt.extensions.city_receivers.expectation import make_expectation
-from isac_rt.frame.antennas import antennas_of
+from isac_rt.frame.antennas import Arrays, antennas_of
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import waveform_of
 from isac_rt.propagation.scatter_paths import LinkState
@@ -149,9 +149,7 @@ def test_each_way_against_an_oracle(pattern):
     checked = {True: 0, False: 0}
     for tx, rx in (("A", "P"), ("A", "A")):
         start, end = discs[tx], discs[rx]
-        sets = model.two_bounces.paths(
-            LinkState(Link(tx, rx), 0.0, start, end), model._free.antennas
-        )
+        sets = model.two_bounces.paths(LinkState(Link(tx, rx), 0.0, start, end), model._free.arrays)
         for part, paths in zip(
             model.two_bounces.seen(LinkState(Link(tx, rx), 0.0, start, end)), sets, strict=True
         ):
@@ -475,7 +473,7 @@ def test_what_a_terminal_expects_of_mirrors():
     )
     model = propagation_in(city, s)
     swarm = swarm_of(s)
-    copy = make_expectation(s.clutter, swarm, city, w, antennas, s.seed)
+    copy = make_expectation(s.clutter, swarm, city, w, Arrays(antennas), s.seed)
     pose = swarm.poses(0.0)["A"]
     parts = copy._two_bounces.seen(LinkState(Link("A", "A"), 0.0, pose, pose))
     once = len(copy._own.seen(LinkState(Link("A", "A"), 0.0, pose, pose)).index)
@@ -526,7 +524,7 @@ def test_what_a_passive_terminal_expects_of_mirrors():
     antennas = antennas_of(s.array, w)
     city = joined(rectangle(*WALL, METAL), rectangle(*GROUND, METAL))
     swarm, link = swarm_of(s), Link("A", "P")
-    copy = make_expectation(s.clutter, swarm, city, w, antennas, s.seed)
+    copy = make_expectation(s.clutter, swarm, city, w, Arrays(antennas), s.seed)
     own = swarm.poses(0.0)["P"]
     sender = np.array([0.7, -1.3, 1.1, 3.1, -2.3, 0.7])
     start = replace(own, position=sender[:3], velocity=sender[3:])
