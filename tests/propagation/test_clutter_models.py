@@ -140,7 +140,7 @@ def test_gaussian_clutter_is_noise_beside_the_noise():
             if model == "link_budget":
                 overrides += [f"swarm.{name}.rcs.model=constant" for name in ("AT", "PT1", "PT2")]
             setup = prepare(load(SCENES / "paper_swarm_consistent.yaml", overrides, frames=4))
-            levels.append(setup.noise_power(setup.swarm.poses(0.0), ("AT", "PT1")))
+            levels.append(setup.noise_power(setup.swarm.poses(0.0), Link("AT", "PT1")))
         assert levels[0] > 0
         assert levels[1] / levels[0] == pytest.approx(1 + 10**0.32, rel=1e-12, abs=0)
 
