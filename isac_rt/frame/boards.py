@@ -40,9 +40,10 @@ class Board:
     receivers : switched on
     chirps : transmitter of each chirp of a loop
     loops, frames : loops of a frame; frames, 0: without end
-    period : from frame to frame [s]
+    period : from frame to frame [s], 0: not stated
     sampling : kind of a sample
     interleaved : receivers stand together, None: not stated
+    q_first : Q stands before I
     """
 
     start_hz: float
@@ -59,6 +60,7 @@ class Board:
     period: float
     sampling: Sampling
     interleaved: bool | None = None
+    q_first: bool = False
 
     def description(self) -> dict[str, Any]:
         """Keys of a description of the board's samples (`isac-rt import`). The elements are those
@@ -72,11 +74,12 @@ class Board:
             "receivers": self.receivers,
             "chirps": self._numbered(),
             "loops": self.loops,
-            "frames": max(self.frames, 1),
+            "frames": self.frames,
             "chirp_interval_us": (self.idle + self.ramp_end) * 1e6,
-            "frame_interval_ms": self.period * 1e3,
+            "frame_interval_ms": self.period * 1e3 or None,
             "sampling": self.sampling,
             "interleaved": bool(self.interleaved),
+            "q_first": self.q_first,
         }
         if self.receivers == 4 and max(self.chirps) < len(TI_TX):
             places = {
@@ -187,7 +190,7 @@ def _board(
     profile: Mapping[str, float],
     chirps: Sequence[_Chirp],
     frame: tuple[int, int, int, int, float],
-    about: tuple[int, Sampling, bool | None],
+    about: tuple[int, Sampling, bool | None, bool],
 ) -> Board:
     """Put the parts of a file together."""
     first, last, loops, frames, period = frame
@@ -207,7 +210,7 @@ def _board(
     counts = {order.count(tx) for tx in set(order)}
     if len(counts) > 1:
         raise place.fail("transmitters do not send equally often in a loop; let them")
-    receivers, sampling, interleaved = about
+    receivers, sampling, interleaved, q_first = about
     return Board(
         start_hz=profile["startFreq"] * 1e9,
         slope=profile["freqSlopeConst"] * 1e12,
@@ -223,6 +226,7 @@ def _board(
         period=period * 1e-3,
         sampling=sampling,
         interleaved=interleaved,
+        q_first=q_first,
     )
 
 
@@ -280,11 +284,12 @@ def _of_cfg(file: Path, text: str) -> Board:
     at, words = one("adcCfg", 2)
     sampling = _SAMPLINGS[int(at.number(words[1], "the output format", 0, 2))]
     buffers = all_of("adcbufCfg", 4)
-    interleaved = None
-    if buffers:
+    interleaved, q_first = None, False
+    if buffers:  # newer ones state a subframe first
         at, words = buffers[0]
+        q_first = at.number(words[-3], "SampleSwap", 0, 1) == 1
         interleaved = at.number(words[-2], "the channels' order", 0, 1) == 0
-    return _board(whole, profile, chirps, frame, (receivers, sampling, interleaved))
+    return _board(whole, profile, chirps, frame, (receivers, sampling, interleaved, q_first))
 
 
 def _commands(file: Path, text: str) -> Iterator[tuple[_Place, str, list[str]]]:
@@ -320,7 +325,8 @@ def _of_json(file: Path, text: str) -> Board:
         }
         stated = [one["rlChirpCfg_t"] for one in rf["rlChirps"]]
         capture = device.get("rawDataCaptureConfig") or {}
-        order = (capture.get("rlDevDataFmtCfg_t") or {}).get("chInterleave")
+        order = capture.get("rlDevDataFmtCfg_t") or {}
+        channels, swapped = order.get("chInterleave"), order.get("iqSwapSel")
     except (*BAD_DATA, RecursionError) as problem:
         raise BoardFileError(
             f"{file}: is no configuration of mmWave Studio ({type(problem).__name__}: "
@@ -341,10 +347,11 @@ def _of_json(file: Path, text: str) -> Board:
     )
     receivers = int(value("rlChanCfg_t", "rxChannelEn", 1, 65535)).bit_count()
     sampling = _SAMPLINGS[int(value("fmt", "b2AdcOutFmt", 0, 2))]
-    interleaved = None if order is None else order == 0
+    interleaved = None if channels is None else channels == 0
     if not chirps:
         raise BoardFileError(f"{file}: rlChirps is empty; give the board's whole configuration")
-    return _board(_Place(file, ""), profile, chirps, frame, (receivers, sampling, interleaved))
+    about = receivers, sampling, interleaved, swapped == 1
+    return _board(_Place(file, ""), profile, chirps, frame, about)
 
 
 def _values(file: Path, parts: Mapping[str, Any]) -> Callable[[str, str, float, float], float]:

@@ -187,9 +187,9 @@ def new_variables(dataset: xr.Dataset) -> xr.Dataset:
     return dataset
 
 
-def check_folder(folder: str | Path) -> None:
-    """Refuse a folder that cannot be made or written, or has little room, before a long run rather
-    than after it.
+def check_folder(folder: str | Path, room: float | None = None) -> None:
+    """Refuse a folder that cannot be made or written, or has less room [bytes], before a long run
+    rather than after it.
 
     Raises
     ------
@@ -199,10 +199,11 @@ def check_folder(folder: str | Path) -> None:
     write_whole(probe, "")
     probe.unlink(missing_ok=True)
     free = shutil.disk_usage(folder).free
-    if free < ROOM_BYTES:
+    room = ROOM_BYTES if room is None else room
+    if free < room:
         raise StorageError(
-            f"{folder}: {free / 1e6:.0f} MB are free, a run is given {ROOM_BYTES / 1e6:.0f} MB at "
-            "least; choose another folder with --out, or make room"
+            f"{folder}: {free / 1e6:.0f} MB are free, {room / 1e6:.0f} MB are needed; choose "
+            "another folder with --out, or make room"
         )
 
 

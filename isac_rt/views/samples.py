@@ -21,9 +21,11 @@ import numpy as np
 import yaml
 
 from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.boards import Board
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.results.files import check_folder
 from isac_rt.runtime import UserError
 from isac_rt.simulation.setup import Setup
 from isac_rt.storage import StorageError
@@ -54,6 +56,8 @@ class Recorded(NamedTuple):
 class Writer(Protocol):
     """Files of one link, to which frames are added in turn."""
 
+    sample_bytes: int
+
     def __init__(self, folder: Path, first: Recorded, frames: int) -> None: ...
 
     def add(self, one: Recorded) -> None:
@@ -83,10 +87,14 @@ def write_samples(
     Raises
     ------
     SampleError  If the format cannot hold them.
-    isac_rt.storage.StorageError  If the folder cannot be written.
+    isac_rt.storage.StorageError  If the folder cannot be written or has too little room.
     """
     writers: dict[Link, Writer] = {}
     received = {f: setup.timetable.links(f) for f in frames}
+    w = setup.waveform
+    rows = sum(setup.arrays.at(one).num_rx for f in frames for one in links if one in received[f])
+    size = rows * w.num_groups * w.num_chirps * w.num_samples
+    check_folder(folder, size * _WRITERS[form].sample_bytes)
     with _staged(Path(folder)) as staged:
         for done, number in enumerate(frames):
             report(done, len(frames))
@@ -133,6 +141,8 @@ def _staged(folder: Path) -> Iterator[_Staged]:
 class _Numpy:
     """`LINK.npy`, complex64 over `AXES`, and `LINK.json`: axes, waveform, schedules, times."""
 
+    sample_bytes = 8
+
     def __init__(self, folder: Path, first: Recorded, frames: int) -> None:
         self._file, self._about = folder / f"{first.name}.npy", folder / f"{first.name}.json"
         shape = frames, *first.cube.samples.shape
@@ -152,6 +162,8 @@ class _Numpy:
 
 class _Single:
     """Files of their own for each frame: MATLAB or SigMF."""
+
+    sample_bytes = 8
 
     def __init__(self, folder: Path, first: Recorded, frames: int) -> None:
         self._folder = folder
@@ -195,6 +207,8 @@ class _Dca1000:
     "Mmwave Radar Device ADC Raw Data Capture", SWRA581B, section 24).
     """
 
+    sample_bytes = 4
+
     def __init__(self, folder: Path, first: Recorded, frames: int) -> None:
         w, schedule = first.cube.waveform, np.asarray(first.cube.schedule)
         if w.sweep is None or len(schedule) > 1:
@@ -232,27 +246,27 @@ class _Dca1000:
         w, antennas = self._first.cube.waveform, self._first.antennas
         assert w.sweep is not None
         half = SPEED_OF_LIGHT / w.carrier_frequency / 2
-        about = {
-            "format": "dca1000",
-            "carrier_hz": w.carrier_frequency,
-            "slope_mhz_per_us": w.sweep.slope / 1e12,
-            "adc_start_us": w.sweep.adc_start * 1e6,
-            "sampling_rate_hz": w.sampling_rate,
-            "samples_per_chirp": w.num_samples,
-            "receivers": antennas.num_rx,
-            "chirps": self._loop,
-            "loops": w.num_chirps // len(self._loop),
-            "frames": self._frames,
-            "chirp_interval_us": w.sweep.repetition * 1e6,
-            "frame_interval_ms": 1e3 * float(np.diff(self._starts).mean())
-            if self._frames > 1
-            else None,
-            "sampling": "complex_1x",
-            "elements": {
-                "unit_hz": w.carrier_frequency,
-                "transmitters": (antennas.tx_positions[:, [0, 2]] / half).tolist(),
-                "receivers": (antennas.rx_positions[:, [0, 2]] / half).tolist(),
-            },
+        used = sorted(set(self._loop))
+        board = Board(
+            start_hz=w.carrier_frequency,
+            slope=w.sweep.slope,
+            idle=w.sweep.repetition - w.sweep.ramp_end,
+            adc_start=w.sweep.adc_start,
+            ramp_end=w.sweep.ramp_end,
+            samples=w.num_samples,
+            rate=w.sampling_rate,
+            receivers=antennas.num_rx,
+            chirps=tuple(self._loop),
+            loops=w.num_chirps // len(self._loop),
+            frames=self._frames,
+            period=float(np.diff(self._starts).mean()) if self._frames > 1 else 0.0,
+            sampling="complex_1x",
+        )
+        about = {"format": "dca1000"} | board.description()
+        about["elements"] = {
+            "unit_hz": w.carrier_frequency,
+            "transmitters": (antennas.tx_positions[used][:, [0, 2]] / half).tolist(),
+            "receivers": (antennas.rx_positions[:, [0, 2]] / half).tolist(),
         }
         note = f"# 1 count is {1 / self._scale:.9g} sqrt(W)\n"
         self._about.write_text(note + yaml.safe_dump(about, sort_keys=False))

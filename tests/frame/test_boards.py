@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 
 from isac_rt.document import ScenarioError
 from isac_rt.extensions.hardware.description import load_description
+from isac_rt.extensions.hardware.readers import import_file, import_frames
 from isac_rt.extensions.hardware.types import CaptureError
 from isac_rt.frame.boards import BoardFileError, read_board
 from isac_rt.scenario.file import load
@@ -63,7 +65,7 @@ STUDIO = {
                     "framePeriodicity_msec": 100.0,
                 },
             },
-            "rawDataCaptureConfig": {"rlDevDataFmtCfg_t": {"chInterleave": 1}},
+            "rawDataCaptureConfig": {"rlDevDataFmtCfg_t": {"chInterleave": 1, "iqSwapSel": 1}},
         }
     ]
 }
@@ -92,7 +94,7 @@ def test_both_files_say_what_the_board_does(files):
     assert (board.chirps, board.loops, board.frames, board.receivers) == ((0, 2), 16, 40, 4)
     times = board.idle, board.adc_start, board.ramp_end, board.period
     assert times == pytest.approx((267e-6, 7e-6, 57.14e-6, 0.1))
-    assert board.interleaved is False
+    assert board.interleaved is False and board.q_first
 
 
 def test_a_description_and_a_scenario_have_its_chirp(files):
@@ -139,6 +141,33 @@ def test_what_is_wrong_is_said_with_its_line(files, old, new, said):
     (files / "s.yaml").write_text(SWARM.format("b.cfg"))
     with pytest.raises(ScenarioError, match=r"s\.yaml:2: sensor: .*" + said):
         load(files / "s.yaml")
+
+
+@pytest.mark.parametrize(("swap", "cell"), [(1, 20), (0, 236)])
+def test_the_order_of_i_and_q_and_the_frames_of_an_endless_board(files, swap, cell):
+    """A tone of 20 cells, written Q first (Q Q I I), comes back as two frames; read as I first its
+    beat is mirrored. A frame cut off and one beyond the last are refused. Planted bugs: SampleSwap
+    taken from the place before it; frames: 1 where frameCfg says 0."""
+    tone = np.exp(2j * np.pi * 20 / 256 * np.arange(256))
+    counts = np.rint(1000 * np.stack([tone.imag, tone.real])).astype("<i2")
+    words = counts.reshape(2, 128, 2).swapaxes(0, 1).tobytes()  # Q Q I I
+    frame = words * (32 * 4)
+    (files / "a.bin").write_bytes(frame * 2)
+    text = CFG.replace("1 1 1\nprofile", f"{swap} 1 1\nprofile").replace(" 16 40 100", " 16 0 100")
+    (files / "b.cfg").write_text(text)
+    found = import_frames(files / "a.bin", load_description(files / "b.cfg"))
+    assert len(found) == 2
+    for capture in (found[0], found[1]):
+        assert capture.cube.samples.shape == (1, 4, 32, 256)
+        spectra = np.abs(np.fft.fft(capture.cube.samples, axis=-1))
+        assert (spectra.argmax(axis=-1) == cell).all()
+    (files / "a.bin").write_bytes(frame * 2 + words)
+    with pytest.raises(CaptureError, match=f"or cut the file off at {2 * len(frame)} bytes"):
+        import_frames(files / "a.bin", load_description(files / "b.cfg"))
+    (files / "a.bin").write_bytes(frame * 2)
+    late = load_description(files / "b.cfg").model_copy(update={"frame": 2})
+    with pytest.raises(CaptureError, match="has frames 0 to 1; frame: 2 is none"):
+        import_file(files / "a.bin", late)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from isac_rt.frame.link import Link
 from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare
+from isac_rt.storage import StorageError
 from isac_rt.views.points import point_cloud, write_points
 from isac_rt.views.samples import SampleError, dca1000_words, write_samples
 
@@ -113,6 +115,21 @@ def test_what_cannot_be_held_leaves_nothing(tmp_path):
     with pytest.raises(SampleError, match="use mode: fmcw"):
         write_samples(setup, [0], [Link("AT", "PT")], "bin", tmp_path / "out")
     assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_disk_without_room_is_refused_before_the_first_frame(board, tmp_path, monkeypatch):
+    """Three frames of 4 receivers x chirps x samples of 4 bytes: with a byte less free no frame is
+    simulated. Planted bugs: room for one frame; bytes of complex samples for words."""
+    w = board.waveform
+    size = 3 * 4 * w.num_chirps * w.num_samples * 4
+    free = shutil.disk_usage(tmp_path)._replace(free=size)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: free)
+    write_samples(board, range(3), [Link("R", "R")], "bin", tmp_path)
+    assert (tmp_path / "R.bin").stat().st_size == size
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: free._replace(free=size - 1))
+    monkeypatch.setattr(type(board), "frame", lambda *_: pytest.fail("a frame was simulated"))
+    with pytest.raises(StorageError, match="MB are needed"):
+        write_samples(board, range(3), [Link("R", "R")], "bin", tmp_path)
 
 
 def test_points_lie_where_targets_are(tmp_path):

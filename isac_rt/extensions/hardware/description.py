@@ -67,8 +67,8 @@ class Description(Node):
     often."""
     loops: Count = 1
     """How often a frame repeats the chirps."""
-    frames: Count = 1
-    """Frames in the file."""
+    frames: Annotated[int, Field(ge=0, le=1_000_000)] = 1
+    """Frames in the file; 0: as many as its size says."""
     frame: Annotated[int, Field(ge=0)] = 0
     """Frame that is read, counted from 0."""
     chirp_interval_us: Annotated[float, Field(gt=0, le=1e6)] | None = None
@@ -112,7 +112,7 @@ class Description(Node):
             yield Problem(
                 (("axes",),), "must name frame, loop, chirp, receiver and sample once each"
             )
-        if self.frame >= self.frames:
+        if 0 < self.frames <= self.frame:
             yield Problem(
                 (("frame",), ("frames",)),
                 f"there are frames 0 to {self.frames - 1}; choose one of these",

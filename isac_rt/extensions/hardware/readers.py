@@ -67,7 +67,10 @@ def import_file(
         number.
     """
     found = import_frames(file, description, format)
-    return found[0 if description is None or len(found) == 1 else description.frame]
+    frame = 0 if description is None or len(found) == 1 else description.frame
+    if frame >= len(found):
+        raise CaptureError(f"{file}: has frames 0 to {len(found) - 1}; frame: {frame} is none")
+    return found[frame]
 
 
 def import_frames(
@@ -219,10 +222,12 @@ def _without_window(file: Path, spectra: np.ndarray, stated: int | None) -> np.n
 def _dca1000(file: Path, d: Description) -> Recording:
     """Raw samples of 16 bits as TI's capture card streams them."""
     said = _complete(file, d)
-    rows, num_rx, size = said.frames * said.loops * len(said.chirps), said.receivers, said.size
+    rows, num_rx, size = said.loops * len(said.chirps), said.receivers, said.size
     parts = 1 if d.sampling == "real" else 2
     content = _read(file)
-    _fits(file, said, len(content), 2 * parts * rows * num_rx * size)
+    said = _counted(said, len(content), 2 * parts * rows * num_rx * size)
+    _fits(file, said, len(content), 2 * parts * said.frames * rows * num_rx * size)
+    rows *= said.frames
     words = np.frombuffer(content, "<i2").astype(np.float32)
     shape = (rows, size, num_rx) if d.interleaved else (rows, num_rx, size)
     if parts == 1:
@@ -366,6 +371,8 @@ def _unwrapped(values: np.ndarray, d: Description) -> np.ndarray:
 def _ordered(file: Path, array: np.ndarray, d: Description, kind: str) -> Recording:
     """The frames of an array whose axes the description names."""
     said = _complete(file, d)
+    of_frame = said.loops * len(said.chirps) * said.receivers * said.size
+    said = _counted(said, array.size, of_frame)
     sizes = {
         "frame": said.frames,
         "loop": said.loops,
@@ -428,6 +435,11 @@ def _read(file: Path, most: int = MOST_BYTES) -> bytes:
         raise CaptureError(f"{file}: cannot be read: {problem.strerror}; check the path") from None
 
 
+def _counted(d: _Complete, found: int, each: int) -> _Complete:
+    """Return a description that states the frames of a file, which 0 leaves to its size."""
+    return d if d.frames else d.model_copy(update={"frames": max(1, found // each)})
+
+
 def _fits(file: Path, d: _Complete, found: int, wanted: int) -> None:
     """Refuse a file of another size. A recording that was cut off within a frame cannot be told
     from a wrong description, so neither is read."""
@@ -435,7 +447,9 @@ def _fits(file: Path, d: _Complete, found: int, wanted: int) -> None:
         return
     each = wanted // d.frames
     whole, rest = divmod(found, each)
-    offer = f"state frames: {whole}" if whole and not rest else "correct the description"
+    offer = "correct the description"
+    if whole and not rest:
+        offer = f"state frames: {whole} (frameCfg or numFrames of a board's file), or 0 for all"
     if whole and rest:
         offer += f", or cut the file off at {whole * each} bytes, its last whole frame"
     raise CaptureError(
