@@ -226,11 +226,11 @@ class Scenes:
 
     def sees(self, place: str, points: np.ndarray) -> np.ndarray:
         """(K,) whether the terminal sees points (K, 3) in the air."""
-        from isac_rt.propagation.segments.rays import Shadows
+        from isac_rt.propagation.segments.rays import LosTest
         from isac_rt.world.city.scene import shared_scenes
 
         s = self.setup
-        shadows = Shadows(shared_scenes(s.city, s.waveform.carrier_frequency).faces)
+        shadows = LosTest(shared_scenes(s.city, s.waveform.carrier_frequency).faces)
         return shadows.sees(
             np.array(PLACES[place].position) - s.city.origin,
             points - s.city.origin,

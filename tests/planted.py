@@ -580,7 +580,7 @@ OF_TESTS = (
     ),
     (
         "test_hard_signal::test_one_path_80_db_above_another",
-        Bug("signal/methods.py", "(strong & top) | tones.sight", "(strong & top & tones.sight)"),
+        Bug("signal/methods.py", "(strong & top) | tones.is_los", "(strong & top & tones.is_los)"),
     ),
     (
         "test_hard_signal::test_a_million_paths",
@@ -638,8 +638,8 @@ OF_TESTS = (
         "test_ghost_images::test_reflections_are_the_images_that_each_end_sees",
         Bug(
             "extensions/city_receivers/ghosts.py",
-            "*_images(body, start, walls, reach)",
-            "*_images(body, here, walls, reach)",
+            "*_images(target, start, walls, reach)",
+            "*_images(target, here, walls, reach)",
         ),
     ),
     (
@@ -648,7 +648,7 @@ OF_TESTS = (
     ),
     (
         "test_view::test_a_body_is_in_view_of_both_ends",
-        Bug("results/metrics.py", "ends.append((active, uav))", "pass"),
+        Bug("results/metrics.py", "ends.append((tx, uav))", "pass"),
     ),
     (
         "test_access_stages::test_the_timetable_on_paper",
@@ -800,8 +800,8 @@ OF_TESTS = (
         "test_interference::test_radars_that_do_not_receive_each_other_are_not",
         Bug(
             "simulation/preflight.py",
-            "sent = float(antennas.element_gain(tx.to_body(polyline / distance)))",
-            "sent = antennas.gain",
+            "sent = float(sending.element_gain(tx.to_body(polyline / distance)))",
+            "sent = sending.gain",
         ),
     ),
 )

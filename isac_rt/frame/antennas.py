@@ -54,12 +54,12 @@ def centred(layout: Layout) -> np.ndarray:
     return positions
 
 
-def folded(cosines: npt.ArrayLike, turns: npt.ArrayLike) -> np.ndarray:
-    """Direction cosines (..., 2), or differences of some, less the multiples of `turns` (2,) that
-    they are nearest to (`Antennas.turns`)."""
+def folded(cosines: npt.ArrayLike, cosine_period: npt.ArrayLike) -> np.ndarray:
+    """Direction cosines (..., 2), or differences of some, less the multiples of `cosine_period`
+    (2,) that they are nearest to (`Antennas.cosine_period`)."""
     u = np.asarray(cosines)
-    finite = np.where(np.isfinite(turns), turns, 0.0)
-    return np.asarray(u - finite * np.round(u / turns))
+    finite = np.where(np.isfinite(cosine_period), cosine_period, 0.0)
+    return np.asarray(u - finite * np.round(u / cosine_period))
 
 
 def unit_vector(cosines: npt.ArrayLike) -> np.ndarray:
@@ -171,11 +171,11 @@ class Antennas:
         element: the sums of both ends' places."""
         return (self.tx_positions[:, None] + self.rx_positions[None]).reshape(-1, 3)
 
-    def turns(self, wavelength: float, passes: int) -> np.ndarray:
+    def cosine_period(self, wavelength: float, passes: int) -> np.ndarray:
         """(2,) shifts of u_x and u_z that turn no channel of an echo (passes = 2) or no receive
         element against another: the wavelength over the step of which all their distances along
         the axis are multiples. inf: none."""
-        return wavelength * _turns(self, passes)
+        return wavelength * _cosine_period(self, passes)
 
     def observes(self, passes: int) -> tuple[bool, bool]:
         """Return whether directions along X and along Z are observable: the channels of an echo
@@ -262,15 +262,15 @@ def _observes(antennas: Antennas, passes: int) -> tuple[bool, bool]:
 
 
 @lru_cache(maxsize=64)
-def _turns(antennas: Antennas, passes: int) -> np.ndarray:
-    """`Antennas.turns` of a wavelength of 1 m: the steps by Euclid's algorithm."""
+def _cosine_period(antennas: Antennas, passes: int) -> np.ndarray:
+    """`Antennas.cosine_period` of a wavelength of 1 m: the steps by Euclid's algorithm."""
     places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
     steps = np.zeros(2)
     for axis, along in enumerate(places[:, [0, 2]].T):
-        for apart in along - along.min():
-            while apart > SAME_POSITION_M:
-                rest = steps[axis] % apart
-                steps[axis], apart = apart, rest if apart - rest > SAME_POSITION_M else 0.0
+        for spacing in along - along.min():
+            while spacing > SAME_POSITION_M:
+                rest = steps[axis] % spacing
+                steps[axis], spacing = spacing, rest if spacing - rest > SAME_POSITION_M else 0.0
     with np.errstate(divide="ignore"):
         return 1 / steps
 

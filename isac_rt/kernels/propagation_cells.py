@@ -18,9 +18,13 @@ FINER = 4.0
 def leaves(faces, positions, boxes, density, most):
     """`isac_rt.propagation.clutter.cells.leaves`; `boxes` hold the places, `BOX` in each."""
     corners, area, face_states = faces
-    room = max(2 * area.size, 1024)
-    rows, codes = np.empty(room, np.int64), np.empty(room, np.uint64)
-    areas, states, points = np.empty(room), np.empty(room, np.uint64), np.empty((room, 3))
+    capacity = max(2 * area.size, 1024)
+    rows, codes = np.empty(capacity, np.int64), np.empty(capacity, np.uint64)
+    areas, states, points = (
+        np.empty(capacity),
+        np.empty(capacity, np.uint64),
+        np.empty((capacity, 3)),
+    )
     line_codes, line_areas = np.empty(64, np.uint64), np.empty(64)
     line = np.empty((64, 3, 3))  # cells of one face that wait, those of few halvings first
     spans = np.empty((64, 2))  # their distances to the nearest place lie between these

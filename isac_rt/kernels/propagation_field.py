@@ -71,13 +71,13 @@ def scattered_power(surfaces, face, area, into, back, between, part):
 
 
 @jit(inline=True)
-def segment_to(px, py, pz, body):
+def segment_to(px, py, pz, platform):
     """Distance from a moving body to a point, its rate and acceleration, and the unit vector
     towards the point."""
-    x, y, z = px - body[0, 0], py - body[0, 1], pz - body[0, 2]
+    x, y, z = px - platform[0, 0], py - platform[0, 1], pz - platform[0, 2]
     r = np.sqrt(x * x + y * y + z * z)
     x, y, z = x / r, y / r, z / r
-    a = -(x * body[1, 0] + y * body[1, 1] + z * body[1, 2])
-    speed = body[1, 0] ** 2 + body[1, 1] ** 2 + body[1, 2] ** 2
-    b = (speed - a * a) / r - (x * body[2, 0] + y * body[2, 1] + z * body[2, 2])
+    a = -(x * platform[1, 0] + y * platform[1, 1] + z * platform[1, 2])
+    speed = platform[1, 0] ** 2 + platform[1, 1] ** 2 + platform[1, 2] ** 2
+    b = (speed - a * a) / r - (x * platform[2, 0] + y * platform[2, 1] + z * platform[2, 2])
     return r, a, b, x, y, z

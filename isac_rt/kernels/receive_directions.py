@@ -59,17 +59,18 @@ def line_bounds(maps, channels, spectra, out):
 
 
 @jit(fast=True)
-def search_directions(along_x, along_z, turns_z, turns_x, inside, scale, peak, place):
+def search_directions(along_x, along_z, phasors_z, phasors_x, inside, scale, peak, place):
     """`isac_rt.receive.directions.search_directions`, sixteen directions at once."""
     looks, count = along_x.shape[1], along_x.shape[3]
     lines, size = along_z.shape[2], along_z.shape[3]
-    turns, each, power = turns_z.reshape(-1), scale.reshape(-1), np.empty(count * size, np.float32)
+    phasors, each = phasors_z.reshape(-1), scale.reshape(-1)
+    power = np.empty(count * size, np.float32)
     channels_read, zero = np.empty(looks * 2 * lines * size, np.float32), splat(np.float32(0))
-    sine, line = turns_z.shape[1] * size, 2 * lines * size
+    sine, line = phasors_z.shape[1] * size, 2 * lines * size
     for s in range(along_x.shape[0]):
         norm = min(s, scale.shape[0] - 1) * power.size
         for t in range(looks):
-            _apart(along_z[s, t], channels_read[t * line : (t + 1) * line])
+            _deinterleave(along_z[s, t], channels_read[t * line : (t + 1) * line])
         for i in range(count):
             for j in range(0, size, LANES):
                 total = zero
@@ -77,10 +78,10 @@ def search_directions(along_x, along_z, turns_z, turns_x, inside, scale, peak, p
                     re, im = zero, zero
                     for k in range(along_x.shape[2]):
                         a, b = splat(along_x[s, t, k, i].real), splat(along_x[s, t, k, i].imag)
-                        c, d = load(turns, k * size + j), load(turns, sine + k * size + j)
+                        c, d = load(phasors, k * size + j), load(phasors, sine + k * size + j)
                         re, im = re + a * c - b * d, im + a * d + b * c
                     for k in range(lines):
-                        a, b = splat(turns_x[0, k, i]), splat(turns_x[1, k, i])
+                        a, b = splat(phasors_x[0, k, i]), splat(phasors_x[1, k, i])
                         at = t * line + k * size + j
                         c, d = load(channels_read, at), load(channels_read, at + lines * size)
                         re, im = re + a * c - b * d, im + a * d + b * c
@@ -97,7 +98,7 @@ def search_directions(along_x, along_z, turns_z, turns_x, inside, scale, peak, p
 
 
 @jit(borrows=True)
-def _apart(lines, out):
+def _deinterleave(lines, out):
     """All real parts of the lines, then all imaginary ones."""
     count, size = lines.shape
     for k in range(count):
@@ -142,13 +143,13 @@ class Axis(NamedTuple):
     ----------
     ends : (lines + 1,) where the channels of each line begin and end
     cosines, sines : (G, n) of exp(+j k v u) along the lines
-    turns : (2, lines, H), the same of the lines' places on the other axis
+    phasors : (2, lines, H), the same of the lines' places on the other axis
     """
 
     ends: np.ndarray
     cosines: np.ndarray
     sines: np.ndarray
-    turns: np.ndarray
+    phasors: np.ndarray
 
 
 @jit(fast=True)
@@ -167,7 +168,7 @@ def quadratic_forms(matrices, order, x, z, out):
     far = np.empty((2, x.ends.size - 1, high, num_z), np.float32)
     for p in range(x.ends.size - 1):
         for j in range(high):
-            c, d = x.turns[0, p, j], x.turns[1, p, j]
+            c, d = x.phasors[0, p, j], x.phasors[1, p, j]
             for n in range(num_z):
                 far[0, p, j, n] = c * z.cosines[j, n] + d * z.sines[j, n]
                 far[1, p, j, n] = d * z.cosines[j, n] - c * z.sines[j, n]
@@ -185,7 +186,7 @@ def quadratic_forms(matrices, order, x, z, out):
         for i in range(wide):
             for p in range(x.ends.size - 1):
                 for r in range(z.ends.size - 1):
-                    c, d = splat(two * z.turns[0, r, i]), splat(two * z.turns[1, r, i])
+                    c, d = splat(two * z.phasors[0, r, i]), splat(two * z.phasors[1, r, i])
                     for n in range(z.ends[r], z.ends[r + 1]):
                         re, im = _sum(channels_read, count, num_x + n, x, p, 0, i)
                         store(near, n * pair, re * c + im * d)
@@ -228,9 +229,9 @@ def _within(channels_read, count, begin, lines, total, step, other):
                     a, b = _sum(channels_read, count, begin + n, lines, p, begin, g)
                     c, d = splat(lines.cosines[g, n]), splat(lines.sines[g, n])
                     re, im = re + a * c + b * d, im + b * c - a * d
-                for h in range(lines.turns.shape[2]):
-                    a, b = lines.turns[0, p, h], lines.turns[1, p, h]
-                    c, d = lines.turns[0, q, h], lines.turns[1, q, h]
+                for h in range(lines.phasors.shape[2]):
+                    a, b = lines.phasors[0, p, h], lines.phasors[1, p, h]
+                    c, d = lines.phasors[0, q, h], lines.phasors[1, q, h]
                     at = (g * step + h * other) * LANES
                     turned = re * splat(a * c + b * d) - im * splat(b * c - a * d)
                     store(total, at, load(total, at) + turned)

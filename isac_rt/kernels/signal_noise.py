@@ -11,7 +11,7 @@ _BLOCK = 512
 """Samples whose words stay in the nearest cache."""
 _PARITY = np.uint32(0x1BD11BDA)  # Threefish key-schedule constant, 32-bit variant
 _LN2 = np.float32(np.log(2.0))
-_TURN = np.float32(2 * np.pi)
+_TWO_PI = np.float32(2 * np.pi)
 _UNIT = np.float32(2.0**-32)
 _ONE, _HALF, _QUARTER, _FOUR = np.float32(1), np.float32(0.5), np.float32(0.25), np.float32(4)
 # Taylor coefficients: of 2 atanh(s) for |s| <= 0.172, and of sine and cosine for |x| <= pi/4; what
@@ -127,7 +127,7 @@ def _cos_sin(word):
     """Cosine and sine of 2 pi word / 2^32, float32."""
     cycles = np.float32(np.int32(word)) * _UNIT
     quarter = np.rint(cycles * _FOUR)
-    x = (cycles - quarter * _QUARTER) * _TURN
+    x = (cycles - quarter * _QUARTER) * _TWO_PI
     q = x * x
     s = x * (_SIN[0] + q * (_SIN[1] + q * (_SIN[2] + q * (_SIN[3] + q * _SIN[4]))))
     c = _COS[0] + q * (_COS[1] + q * (_COS[2] + q * (_COS[3] + q * _COS[4])))

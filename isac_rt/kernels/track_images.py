@@ -25,16 +25,16 @@ def met(start, end, normals, offsets, low, high, first, last, reach):
     some = np.empty(last.size, np.int64)
     for i in first:
         n, d = normals[i], offsets[i]
-        s, apart = _dot(n, start) - d, 0.0
+        s, base2 = _dot(n, start) - d, 0.0
         for c in range(3):  # the start's image in i
             once[c] = start[c] - 2 * s * n[c]
-            apart += (once[c] - end[c]) ** 2
+            base2 += (once[c] - end[c]) ** 2
         for k in range(last.size):
             beyond[k] = x[k] * once[0] + y[k] * once[1] + z[k] * once[2] - of_last[k]
         # a mirror between two points makes the square of the way between them longer by four times
         # the product of their distances from it
-        least = max((2 * LEAST_RANGE) ** 2 - apart, 0.0) / 4
-        most, chosen = (reach**2 - apart) / 4, 0
+        least = max((2 * LEAST_RANGE) ** 2 - base2, 0.0) / 4
+        most, chosen = (reach**2 - base2) / 4, 0
         for k in range(last.size):  # without branches
             some[chosen] = k
             chosen += least < beyond[k] * before[k] < most

@@ -290,7 +290,7 @@ def transpose(typingctx, array, index):
     return types.void(array, types.intp), codegen
 
 
-_HALF_TURN = np.float32(np.pi)
+_PI = np.float32(np.pi)
 _TWO = np.float32(2)
 # Taylor series about 0 up to where the next term is below an ulp at a quarter turn
 _SIN = tuple(np.float32(c) for c in (1, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800))
@@ -317,7 +317,7 @@ def _sum_of(series, q):
 def cos_sin(cycles):
     """Cosine and sine of 2 pi `cycles` (float32, within [-0.55, 0.55]) by the series of half the
     angle; errors below 1.3e-6."""
-    h = cycles * _HALF_TURN
+    h = cycles * _PI
     q = h * h
     s, c = h * _sum_of(_SIN, q), _sum_of(_COS, q)
     twice = _TWO * s
@@ -347,9 +347,9 @@ def cos_sin_double(cycles):
 def unset(size: int) -> np.ndarray:
     """Float32 (size,) of any values from an address that is a multiple of 64: a vector that crosses
     a cache line costs twice."""
-    room = np.empty(4 * size + 64, np.uint8)
-    start = -room.ctypes.data % 64
-    return room[start : start + 4 * size].view(np.float32)
+    buffer = np.empty(4 * size + 64, np.uint8)
+    start = -buffer.ctypes.data % 64
+    return buffer[start : start + 4 * size].view(np.float32)
 
 
 def aligned(size: int) -> np.ndarray:

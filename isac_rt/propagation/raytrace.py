@@ -56,7 +56,7 @@ from isac_rt.propagation.segments.geometry import (
     unfold,
 )
 from isac_rt.propagation.segments.images import PROBES_M, SLACK, STRETCH, Images
-from isac_rt.propagation.segments.rays import Shadows
+from isac_rt.propagation.segments.rays import LosTest
 from isac_rt.propagation.segments.segment_set import SegmentSet, TracedSegments, segment_set
 from isac_rt.propagation.settings import Clutter, Propagation
 from isac_rt.registry import extension
@@ -96,9 +96,9 @@ class RayTracer:
         self._scenes = shared_scenes(city, carrier)
         self._normals, self._offsets = plane_of_each_face(city)
         scene, wavelength = self._scenes.faces, free.wavelength
-        shadows = Shadows(scene)
+        los = LosTest(scene)
         _LOG.info("finding the edges that cast shadows")
-        self._edges = ShadowEdges(city, shadows, wavelength)
+        self._edges = ShadowEdges(city, los, wavelength)
         self.field: ClutterField | None = None
         """The scatterers on the city's surfaces."""
         self.two_bounces: Any = None
@@ -119,7 +119,7 @@ class RayTracer:
             for name in (self._terminals if sample_spacing and depth else [])
         }
         self._search = Search(self._scenes, city, propagation.rays, depth, flights)
-        self._images = Images(city, shadows, wavelength, depth)
+        self._images = Images(city, los, wavelength, depth)
         self._solved_with: int | None = None
         self._clearance = Clearance(city)
 
@@ -220,12 +220,12 @@ class RayTracer:
             scene.add(rt.Transmitter(f"tx-{name}", position=mi.Point3f(*position.tolist())))
         for name, position in sinks.items():
             scene.add(rt.Receiver(f"rx-{name}", position=mi.Point3f(*position.tolist())))
-        room = min((samples_per_src * max_depth + 1) * len(sinks), MOST_PATHS)
+        capacity = min((samples_per_src * max_depth + 1) * len(sinks), MOST_PATHS)
         found = self._solver(
             scene,
             max_depth=max_depth,
             samples_per_src=samples_per_src,
-            max_num_paths_per_src=room,
+            max_num_paths_per_src=capacity,
             refraction=False,
             synthetic_array=True,
             specular_reflection=max_depth > 0,
@@ -341,7 +341,7 @@ class RayTracer:
         parts = [self._by_the_city(state, segments[link])]
         others = [name for name in self._free.names if name not in link]
         if others:
-            parts.append(self._by_way_of(state, {name: local[name] for name in others}, segments))
+            parts.append(self._over_uavs(state, {name: local[name] for name in others}, segments))
         if self.field is not None:
             parts.append(self.field.paths(state, arrays, discs))
         if self.two_bounces is not None:
@@ -377,7 +377,7 @@ class RayTracer:
             faces=found.faces,
         )
 
-    def _by_way_of(
+    def _over_uavs(
         self, state: LinkState, discs: dict[str, Pose], segments: dict[Link, SegmentSet]
     ) -> PathSet:
         """Echoes and ghosts of UAVs: every segment to one with every segment from it, up to the

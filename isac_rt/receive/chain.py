@@ -73,7 +73,7 @@ def refiner_of(settings: Receivers) -> Refiner | None:
 
 def reader_of(settings: Receivers, dpsk_order: int) -> ByPowers:
     """The symbol reader that the settings name."""
-    hidden = filter_of(settings)
-    run_cells = None if hidden is None else hidden.least
+    clutter_filter = filter_of(settings)
+    run_cells = None if clutter_filter is None else clutter_filter.least
     reader: ByPowers = SYMBOL_READERS.load(settings.symbol_decision)(dpsk_order, run_cells)
     return reader

@@ -55,12 +55,12 @@ class Lines:
     ----------
     members : of each line the numbers of its channels
     spectra : of each line (G, n) complex64, exp(+j k v u) along it
-    turns : (lines, H) complex64, exp(+j k v u) of its place on the other axis
+    phasors : (lines, H) complex64, exp(+j k v u) of its place on the other axis
     """
 
     members: tuple[np.ndarray, ...]
     spectra: tuple[np.ndarray, ...]
-    turns: np.ndarray
+    phasors: np.ndarray
 
     @classmethod
     def of(
@@ -71,8 +71,8 @@ class Lines:
         members = tuple(np.flatnonzero(number == n) for n in np.unique(number[number >= 0]))
         spectra = [np.exp(1j * np.outer(u[axis], places[m, axis])) for m in members]
         other = np.array([places[m[0], 1 - axis] for m in members])
-        turns = np.exp(1j * np.outer(other, u[1 - axis])).astype(np.complex64)
-        return cls(members, tuple(s.astype(np.complex64) for s in spectra), turns)
+        phasors = np.exp(1j * np.outer(other, u[1 - axis])).astype(np.complex64)
+        return cls(members, tuple(s.astype(np.complex64) for s in spectra), phasors)
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Search:
     along_x, along_z : Lines
     inside : (G, H) bool, directions (u_x, u_z) of the unit disc
     wavenumber : [rad/m]
-    turns : (2,) of `Antennas.turns`
+    cosine_period : (2,) of `Antennas.cosine_period`
     beam : (2,) resolution, 0 on an axis that the channels do not observe
     """
 
@@ -97,14 +97,16 @@ class Search:
     along_z: Lines
     inside: np.ndarray
     wavenumber: float
-    turns: np.ndarray
+    cosine_period: np.ndarray
     beam: np.ndarray
 
     @classmethod
-    def of(cls, channels: Channels, wavenumber: float, limit: float, turns: np.ndarray) -> Search:
-        """Directions within `limit` on both axes, or within the half turn that the array tells
+    def of(
+        cls, channels: Channels, wavenumber: float, limit: float, cosine_period: np.ndarray
+    ) -> Search:
+        """Directions within `limit` on both axes, or within the half period that the array tells
         apart."""
-        places, limits = channels.positions[:, [0, 2]], np.minimum(limit, turns / 2)
+        places, limits = channels.positions[:, [0, 2]], np.minimum(limit, cosine_period / 2)
         seen = np.ptp(places, axis=0) > SAME_POSITION_M
         aperture = np.array([aperture_of(along) for along in places.T])
         beam = np.where(seen, 2 * np.pi / (wavenumber * aperture), 0.0)
@@ -120,7 +122,7 @@ class Search:
         along_x = Lines.of(phases, np.where(on_x, row, -1), u, 0)
         along_z = Lines.of(phases, np.where(on_x, -1, column), u, 1)
         inside = np.add.outer(x**2, z**2) <= 1
-        return cls(channels, u, along_x, along_z, inside, wavenumber, turns, beam)
+        return cls(channels, u, along_x, along_z, inside, wavenumber, cosine_period, beam)
 
     @property
     def steps(self) -> np.ndarray:
@@ -139,7 +141,7 @@ class Search:
     def reading(self, cosines: np.ndarray) -> np.ndarray:
         """Directions (..., 2) by the nearest to boresight of those that the channels do not tell
         apart; NaN beyond the horizon, and on an axis that they do not observe."""
-        u = folded(cosines, self.turns)
+        u = folded(cosines, self.cosine_period)
         real = (u**2).sum(axis=-1, keepdims=True) <= 1
         return np.where(real & self.observed, u, np.nan)
 
@@ -151,8 +153,8 @@ class Search:
             ends = np.cumsum([0, *(len(m) for m in lines.members)])
             spectra = np.concatenate([np.zeros((u.size, 0), np.complex64), *lines.spectra], 1)
             cosines, sines = np.stack([spectra.real, spectra.imag])
-            turns = np.stack([lines.turns.real, lines.turns.imag])
-            axes.append(Axis(ends, cosines, sines, turns))
+            phasors = np.stack([lines.phasors.real, lines.phasors.imag])
+            axes.append(Axis(ends, cosines, sines, phasors))
         order = np.concatenate([*self.along_x.members, *self.along_z.members])
         return order, axes[0], axes[1]
 
@@ -171,8 +173,8 @@ class Search:
     def spread(self, cosine: float) -> np.ndarray:
         """(L, L) by which a box of directions, so wide, tapers a covariance."""
         places = self.channels.positions
-        apart = (places[:, None] - places) * self.wavenumber / (2 * np.pi) * cosine
-        return (np.sinc(apart[..., 0]) * np.sinc(apart[..., 2])).astype(np.float32)
+        separation = (places[:, None] - places) * self.wavenumber / (2 * np.pi) * cosine
+        return (np.sinc(separation[..., 0]) * np.sinc(separation[..., 2])).astype(np.float32)
 
     def lines(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Spectra of the lines along X (S, T, lines, G) and Z (S, T, lines, H) of channels (S, T,
@@ -216,8 +218,8 @@ def search_of(antennas: Antennas, wavenumber: float, passes: int, limit: float =
     if passes == 1:
         rx = np.arange(antennas.num_rx)
         channels = Channels(np.zeros_like(rx), rx, antennas.rx_positions)
-    turns = antennas.turns(2 * np.pi / wavenumber, passes)
-    return Search.of(channels, wavenumber, limit, turns)
+    cosine_period = antennas.cosine_period(2 * np.pi / wavenumber, passes)
+    return Search.of(channels, wavenumber, limit, cosine_period)
 
 
 def channel_search(antennas: Antennas, wavenumber: float) -> Search:
@@ -344,11 +346,11 @@ def climbed(
     towards = search.steering(cosines)
     for part in CLIMBED:
         step = part * search.steps
-        turns = search.steering(step * AROUND)  # the phases of two directions add
-        values = statistic(towards[:, None] * turns)
+        phasors = search.steering(step * AROUND)  # the phases of two directions add
+        values = statistic(towards[:, None] * phasors)
         best = values.argmax(axis=1)
         peak, cosines = values[each, best], cosines + step * AROUND[best]
-        towards = towards * turns[best]
+        towards = towards * phasors[best]
     return peak, cosines
 
 
@@ -467,8 +469,8 @@ def quadratic_forms(
     for axis, other in ((x, "ij"), (z, "ji")):
         line = np.repeat(np.arange(axis.ends.size - 1), np.diff(axis.ends))
         along = axis.cosines + 1j * axis.sines
-        turns = (axis.turns[0] + 1j * axis.turns[1])[line]
-        parts.append(np.einsum(f"in,nj->{other}n", along, turns))
+        phasors = (axis.phasors[0] + 1j * axis.phasors[1])[line]
+        parts.append(np.einsum(f"in,nj->{other}n", along, phasors))
     against = np.concatenate(parts, axis=2)  # a^*, of directions (i, j)
     Q = matrices[:, order][:, :, order]
     forms = np.einsum("ijm,smn,ijn->sij", against, Q, against.conj(), optimize=True)
@@ -484,7 +486,7 @@ def strongest_on_grid(
     _, x, z = search.axes
     inside, first = search.inside.ravel().astype(np.float32), [u[0] for u in search.cosines]
     lines = search.lines(y)
-    search_directions(*lines, x.turns, z.turns, inside, scale.astype(np.float32), peak, place)
+    search_directions(*lines, x.phasors, z.phasors, inside, scale.astype(np.float32), peak, place)
     return peak, first + place * search.steps
 
 
@@ -492,8 +494,8 @@ def strongest_on_grid(
 def search_directions(
     along_x: np.ndarray,
     along_z: np.ndarray,
-    turns_z: np.ndarray,
-    turns_x: np.ndarray,
+    phasors_z: np.ndarray,
+    phasors_x: np.ndarray,
     inside: np.ndarray,
     scale: np.ndarray,
     peak: np.ndarray,
@@ -505,13 +507,14 @@ def search_directions(
     Parameters
     ----------
     along_x, along_z : (S, T, lines, G) and (S, T, lines, H) complex64 spectra of the lines
-    turns_z, turns_x : (2, lines, H or G) cosines and sines of the lines' places on the other axis
+    phasors_z, phasors_x : (2, lines, H or G) cosines and sines of the lines' places on the other
+        axis
     inside : (G H) 1 for directions of the unit disc, else 0
     scale : (S or 1, G, H) of the power summed over the looks
     peak, place : (S,) and (S, 2) float32
     """
-    beams = np.einsum("stki,kj->stij", along_x, turns_z[0] + 1j * turns_z[1])
-    beams = beams + np.einsum("stkj,ki->stij", along_z, turns_x[0] + 1j * turns_x[1])
+    beams = np.einsum("stki,kj->stij", along_x, phasors_z[0] + 1j * phasors_z[1])
+    beams = beams + np.einsum("stkj,ki->stij", along_z, phasors_x[0] + 1j * phasors_x[1])
     power = (np.abs(beams) ** 2).sum(axis=1) * scale
     best = (power.reshape(len(power), -1) * inside).argmax(axis=1)
     for s, at in enumerate(zip(*np.divmod(best, power.shape[2]), strict=True)):

@@ -119,8 +119,8 @@ class Known:
         if (self.schedule != np.tile(first, self.schedule.shape[1] // num_tx)).any():
             return np.eye(num_tx)[None] * len(first) / num_tx
         slot = np.argsort(first, axis=1)  # (M, L_tx) of each antenna
-        turn = np.exp(-2j * np.pi * np.arange(num_tx)[:, None, None] * slot / num_tx)
-        return turn.sum(axis=1)[:, None] * np.eye(num_tx) / num_tx
+        phasor = np.exp(-2j * np.pi * np.arange(num_tx)[:, None, None] * slot / num_tx)
+        return phasor.sum(axis=1)[:, None] * np.eye(num_tx) / num_tx
 
     @cached_property
     def times(self) -> np.ndarray:

@@ -119,24 +119,24 @@ def pursue(
     power = power_map(left, known)
     whole = power.copy()
     noise = max(float(np.median(power)), 1e-30)
-    taken = np.zeros(power.shape)  # power under which a cell holds a remainder
+    masked = np.zeros(power.shape)  # power under which a cell holds a remainder
     found: list[_Path] = []
     while len(found) < settings.max_detections:
         above, level = rule.detect(power)
         above[:first] = False
-        above &= power > taken
+        above &= power > masked
         rows, bins = peaks(power, above, (1, 1))
         keep = without_sidelobes(rows, bins, power, power.shape[1], floor)
         rows, bins = (i[keep][: settings.max_detections - len(found)] for i in (rows, bins))
         if not rows.size:
             break
-        changed = _find(left, power, level, (rows, bins), found, taken, known, noise)
+        changed = _find(left, power, level, (rows, bins), found, masked, known, noise)
         if len(found) < settings.max_detections:
             _map_again(power, left, changed, known)
     return [f.estimate for f in found], np.array([f.snr for f in found]), whole
 
 
-class Taken(NamedTuple):
+class StrongPaths(NamedTuple):
     """Strong paths of a frame and the residual.
 
     Attributes
@@ -157,26 +157,26 @@ class Taken(NamedTuple):
     power: np.ndarray
 
 
-def take_strong(spectra: np.ndarray, known: Known, settings: Receivers) -> Taken:
+def extract_strong(spectra: np.ndarray, known: Known, settings: Receivers) -> StrongPaths:
     """Subtract the paths at least `STRONG_DB` over the noise; parameters as for `pursue`."""
     left, floor = spectra.copy(), sidelobe_floor(known)
     maps, power = maps_with_power(left, known)
     whole = known.mapped(spectra, lambda: power)
     power = whole.copy()
     noise = max(float(np.median(power)), 1e-30)
-    taken, level = np.zeros(power.shape), np.full(power.shape, noise)
+    masked, level = np.zeros(power.shape), np.full(power.shape, noise)
     found: list[_Path] = []
     for _ in range(STRONG_ROUNDS):
-        above = power > np.maximum(noise * 10 ** (STRONG_DB / 10), taken)
+        above = power > np.maximum(noise * 10 ** (STRONG_DB / 10), masked)
         rows, bins = peaks(power, above, (1, 1))
         keep = without_sidelobes(rows, bins, power, power.shape[1], floor)
         rows, bins = (i[keep][: settings.max_detections - len(found)] for i in (rows, bins))
         if not rows.size:
             break
-        changed = _find(left, power, level, (rows, bins), found, taken, known, noise)
+        changed = _find(left, power, level, (rows, bins), found, masked, known, noise)
         maps[:, :, changed], power[changed] = maps_with_power(left[:, :, changed], known)
     paths, snr = [f.estimate for f in found], np.array([f.snr for f in found])
-    return Taken(paths, snr, whole, left, maps, power)
+    return StrongPaths(paths, snr, whole, left, maps, power)
 
 
 def _find(
@@ -185,7 +185,7 @@ def _find(
     level: np.ndarray,
     cells: tuple[np.ndarray, np.ndarray],
     found: list[_Path],
-    taken: np.ndarray,
+    masked: np.ndarray,
     known: Known,
     noise: float,
 ) -> np.ndarray:
@@ -197,8 +197,8 @@ def _find(
         local = LocalSpectra(left, known, row)
         estimate = refine(local, *start_point(power, row, column, known.waveform))
         new.append(_Path(estimate, peak, peak / float(level[row, column])))
-        _take_out(left, new[-1], known, noise)
-        _mark(taken, row, column, peak)
+        _subtract(left, new[-1], known, noise)
+        _mark(masked, row, column, peak)
         changed[slice(*new[-1].rows)] = True
     found += new
     _fit_again(left, found, len(new), known, noise, changed)
@@ -220,12 +220,12 @@ def sidelobe_floor(known: Known) -> float:
     return float(np.log(known.waveform.num_chirps) / least)
 
 
-def _mark(taken: np.ndarray, row: int, column: int, peak: float) -> None:
+def _mark(masked: np.ndarray, row: int, column: int, peak: float) -> None:
     """Raise, in place, the power about a peak below which a cell holds its residual."""
-    rows = np.arange(max(row - NEAR[0], 0), min(row + NEAR[0] + 1, len(taken)))
-    columns = (np.arange(-NEAR[1], NEAR[1] + 1) + column) % taken.shape[1]
+    rows = np.arange(max(row - NEAR[0], 0), min(row + NEAR[0] + 1, len(masked)))
+    columns = (np.arange(-NEAR[1], NEAR[1] + 1) + column) % masked.shape[1]
     block = np.ix_(rows, columns)
-    taken[block] = np.maximum(taken[block], peak * 10 ** (-RESIDUAL_DB / 10))
+    masked[block] = np.maximum(masked[block], peak * 10 ** (-RESIDUAL_DB / 10))
 
 
 def _fit_again(
@@ -267,7 +267,7 @@ def _fit_again(
             local = LocalSpectra(spectra, known, row)
             path.estimate = refine(local, before.delay, before.delay_rate, CLOSE)
             if cycle == 0:
-                _take_out(spectra, path, known, noise)
+                _subtract(spectra, path, known, noise)
                 changed[slice(*path.rows)] = True
             else:  # where it comes from it does not change any more
                 _add(spectra, path, known, -1.0)
@@ -282,7 +282,7 @@ def _fit_again(
         near = near[moved]
 
 
-def _take_out(spectra: np.ndarray, path: _Path, known: Known, noise: float) -> None:
+def _subtract(spectra: np.ndarray, path: _Path, known: Known, noise: float) -> None:
     """Subtract a path in place from its rows, with the template of `LocalSpectra` and each
     element's own delay."""
     w, e = known.waveform, path.estimate

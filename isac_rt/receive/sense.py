@@ -88,13 +88,13 @@ class Cfar:
     estimator: Estimator = OFF_GRID
     doppler: LatinUnion | None = None
 
-    def way(self, known: Known) -> LatinUnion:
+    def doppler_method(self, known: Known) -> LatinUnion:
         """Return the Doppler processing of a frame."""
         return self.doppler or doppler_of(known)
 
     def rule(self, known: Known) -> CfarRule:
         """Return the CFAR rule of a frame."""
-        groups = len(known.schedule) if self.way(known).separate else 1
+        groups = len(known.schedule) if self.doppler_method(known).separate else 1
         return CfarRule.of(self.settings, groups * known.channels)
 
     def estimates(
@@ -106,22 +106,22 @@ class Cfar:
         columns: np.ndarray,
     ) -> list[Estimate]:
         """Estimate the paths at peaks (Q,) of the map."""
-        separate = self.way(known).separate
+        separate = self.doppler_method(known).separate
         return self.estimator.at_peaks(spectra, known, power, rows, columns, separate=separate)
 
     def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
         """Compute the range-Doppler map, apply CFAR, and estimate a path at each peak."""
-        way = self.way(known)
-        power = way.power(spectra, known)
+        doppler_method = self.doppler_method(known)
+        power = doppler_method.power(spectra, known)
         above, level = self.rule(known).detect(power)
         above[: first_row(self.settings, known.range_cell)] = False
         sparse, recovered = None, None
-        if way.advises:
-            added = len(known.schedule) if way.separate else 1
+        if doppler_method.advises:
+            added = len(known.schedule) if doppler_method.separate else 1
             noise = float(np.median(power)) * added / window_gain(known)
             rows = np.flatnonzero(above.any(axis=1))
             sparse, recovered = advise(spectra, rows, noise, known)
-        above = way.keep(above, Levels(power, level, recovered), known)
+        above = doppler_method.keep(above, Levels(power, level, recovered), known)
         rows, bins = strongest_peaks(power, above, self.settings, UNION_FLOOR)
         estimates = self.estimates(spectra, known, power, rows, bins)
         snr = power[rows, bins] / level[rows, bins]

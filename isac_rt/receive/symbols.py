@@ -45,7 +45,7 @@ their symbols is their error: wrapping hides a tenth of it at most."""
 
 UNREAD_RATE = 0.1
 """Chance that noise in a chirp reaches the level that half the chirps of a frame must reach."""
-PREDICTED_STDS, READABLE_TURN = 3.0, 1 / 3
+PREDICTED_STDS, MAX_READABLE_CYCLES = 3.0, 1 / 3
 """Deviations of the predicted velocity within which a path moves as predicted, and turn of a mean
 transition [symbols]: beyond it most are wrong."""
 ELSEWHERE_RATE = 1e-4
@@ -111,8 +111,8 @@ class Symbols:
         hold then; else these."""
         for phases in () if decided is None else (decided.phases, decided.second):
             chains = by_antenna(phases, known.schedule, known.waveform.num_tx)
-            turns = np.angle(chains[..., 1:] * chains[..., :-1].conj())
-            transitions = np.round(turns * order / (2 * np.pi)).astype(np.int64) % order
+            phase_steps = np.angle(chains[..., 1:] * chains[..., :-1].conj())
+            transitions = np.round(phase_steps * order / (2 * np.pi)).astype(np.int64) % order
             again = replace(
                 self,
                 transitions=transitions,
@@ -284,9 +284,9 @@ def nearest_symbols(summed: np.ndarray, order: int) -> tuple[np.ndarray, float]:
 
 def least_spread(summed: np.ndarray, length: np.ndarray, far: float, order: int) -> float:
     """Return the least `phase_spread` of `transition_sums`, `length` apart in time [s], of all
-    errors of the Doppler frequency up to `far` [Hz], and to `READABLE_TURN`."""
+    errors of the Doppler frequency up to `far` [Hz], and to `MAX_READABLE_CYCLES`."""
     phase, radians = np.angle(summed), 2 * np.pi * length
-    far = min(far, READABLE_TURN / (order * float(length.mean())))
+    far = min(far, MAX_READABLE_CYCLES / (order * float(length.mean())))
     # neighbouring errors turn the longest transition by a fifth of a symbol
     steps = int(np.ceil(far * length.max() * order / 0.2))
     errors = np.linspace(-far, far, 2 * steps + 1)
@@ -431,11 +431,11 @@ def decide_by_carrier(known: Known, chirps: np.ndarray, order: int) -> CarrierPh
     w = known.waveform
     far = min(FARTHEST, UNAMBIGUOUS * w.num_chirps / order)
     offsets = np.linspace(-far, far, 2 * int(np.ceil(far * order / STEP)) + 1)
-    turns = known.sampled_times / w.frame_duration
+    times = known.sampled_times / w.frame_duration
     powers = (chirps / np.maximum(np.abs(chirps), 1e-300)) ** order
     sums = np.array(
         [
-            np.exp(-2j * np.pi * order * np.outer(offsets, turns[a])) @ powers[a]
+            np.exp(-2j * np.pi * order * np.outer(offsets, times[a])) @ powers[a]
             for a in known.sent_by
         ]
     )
@@ -445,13 +445,13 @@ def decide_by_carrier(known: Known, chirps: np.ndarray, order: int) -> CarrierPh
     if line[best] < special.gammainccinv(w.num_tx, FALSE_RATE / offsets.size):
         return None
     carrier = np.angle(sums[:, best])[known.schedule] / order
-    exact = (np.angle(chirps) - 2 * np.pi * offsets[best] * turns - carrier) * order / (2 * np.pi)
+    exact = (np.angle(chirps) - 2 * np.pi * offsets[best] * times - carrier) * order / (2 * np.pi)
     steps = np.round(exact)
     doubt = np.unravel_index(np.abs(exact - steps).argmax(), steps.shape)
     side = np.sign(exact - steps)[doubt]
     for a in known.sent_by:  # as before, in the middle
-        apart = np.exp(2j * np.pi * steps[a] / order) @ known.phases[a].conj()
-        steps[a] -= np.round(np.angle(apart) * order / (2 * np.pi))
+        common_phase = np.exp(2j * np.pi * steps[a] / order) @ known.phases[a].conj()
+        steps[a] -= np.round(np.angle(common_phase) * order / (2 * np.pi))
     phases = np.exp(2j * np.pi * steps / order)
     second = phases.copy()
     second[doubt] *= np.exp(2j * np.pi * side / order)

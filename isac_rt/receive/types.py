@@ -314,8 +314,8 @@ class Reception:
 
     def __repr__(self) -> str:
         data = f"{self.bits.size} bits decoded" if self.decoded else "no data decoded"
-        sight = "line of sight, " if self.line_of_sight else ""
-        return f"<Reception {len(self.detections)} detections, {sight}{data}>"
+        los = "line of sight, " if self.line_of_sight else ""
+        return f"<Reception {len(self.detections)} detections, {los}{data}>"
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,7 @@ def write_dataset(dataset: xr.Dataset, file: Path) -> None:
     import h5py
 
     made = io.BytesIO()
-    apart = {name: {*c.dims} for name, c in dataset.coords.items() if name not in dataset.dims}
+    auxiliary = {name: {*c.dims} for name, c in dataset.coords.items() if name not in dataset.dims}
     with h5netcdf.File(made, "w", libver=HDF5_FORMAT) as whole:
         whole.dimensions = dict(dataset.sizes)
         whole.attrs.update(dataset.attrs)
@@ -100,7 +100,7 @@ def write_dataset(dataset: xr.Dataset, file: Path) -> None:
             packed = {} if words or not values.size or not values.ndim else COMPRESSION
             if values.dtype == bool:
                 values, said["dtype"] = values.astype(np.int8), "bool"
-            located = [str(other) for other, dims in apart.items() if dims <= {*variable.dims}]
+            located = [str(other) for other, dims in auxiliary.items() if dims <= {*variable.dims}]
             if located and name not in dataset.coords:
                 said["coordinates"] = " ".join(located)
             fill = np.nan if values.dtype.kind == "f" else None

@@ -112,20 +112,20 @@ class Sensitivity:
         if there were noise alone."""
         if self.beam_rate is None:
             return self.detection_probability(snr)
-        return single_look(snr * self.rule.looks, self.beam_rate)
+        return coherent_detection(snr * self.rule.looks, self.beam_rate)
 
     def whitened(self, snr: float) -> float:
         """Probability that one test of the whitened channels of a cell finds a steady path, from
         its SNR there."""
-        return single_look(snr, self.rule.rate if self.beam_rate is None else self.beam_rate)
+        return coherent_detection(snr, self.rule.rate if self.beam_rate is None else self.beam_rate)
 
     def genie(self, snr: float) -> float:
         """Probability that a matched filter at a path's true delay, Doppler and direction finds it,
         from its coherent SNR; its false alarms are those of a cell."""
-        return single_look(snr, self.rule.rate)
+        return coherent_detection(snr, self.rule.rate)
 
 
-def single_look(snr: float, rate: float) -> float:
+def coherent_detection(snr: float, rate: float) -> float:
     """Probability of detection of a steady path by one coherent test with a rate of false
     alarms."""
     return float(1 - chndtr(-2 * np.log(rate), 2, 2 * snr))
@@ -255,13 +255,13 @@ def _beside_sight(own: int, paths: PathSet, waveform: Waveform, channels: Channe
     over an axis of unit length a tone x cells off has sinc(x) along the constant and
     (sinc(x) - cos(pi x)) / (2 pi x) along the line j n, of norm 12^-1/2.
     """
-    sights = np.flatnonzero(paths.kind == PathKind.LINE_OF_SIGHT)
-    if not sights.size:
+    los_paths = np.flatnonzero(paths.kind == PathKind.LINE_OF_SIGHT)
+    if not los_paths.size:
         return 1.0
-    w, sight = waveform, sights[np.argmax(paths.power[sights])]
-    both, middle = np.array([own, sight]), np.zeros(1)
+    w, los = waveform, los_paths[np.argmax(paths.power[los_paths])]
+    both, middle = np.array([own, los]), np.zeros(1)
     beats = w.beat_cells(paths.delay[both, None], paths.delay_rate[both, None], middle)[:, 0]
-    rate = paths.delay_rate[own] - paths.delay_rate[sight]
+    rate = paths.delay_rate[own] - paths.delay_rate[los]
     x = np.array(
         [
             (beats[0] - beats[1]) * w.window_length / w.num_samples,
@@ -277,9 +277,9 @@ def _beside_sight(own: int, paths: PathSet, waveform: Waveform, channels: Channe
     basis = np.hstack([constant, orth(positions - positions.mean(axis=0))])
     steering = np.exp(1j * channels.wavenumber * positions @ (u[0] - u[1])) * constant[:, 0]
     of_receivers = np.abs(basis.T @ steering) ** 2
-    taken = of_receivers.sum() * flat.prod() ** 2
-    taken += of_receivers[0] * ((line[0] * flat[1]) ** 2 + (flat[0] * line[1]) ** 2)
-    return max(1.0 - float(taken), 0.0)
+    overlap = of_receivers.sum() * flat.prod() ** 2
+    overlap += of_receivers[0] * ((line[0] * flat[1]) ** 2 + (flat[0] * line[1]) ** 2)
+    return max(1.0 - float(overlap), 0.0)
 
 
 def _around(

@@ -204,8 +204,8 @@ class Scorer(Stateful):
         names = list(self._swarm.uavs)
         truth: list[Truth | None] = []
         for name in names:
-            by_way = active if self._passes == 1 and name != tx else None
-            truth.append(None if name == rx else truth_of(own, poses[name], by_way))
+            transmitter = active if self._passes == 1 and name != tx else None
+            truth.append(None if name == rx else truth_of(own, poses[name], transmitter))
         inside = np.array(
             [name != rx and within_view(self._arrays, self.link, poses, name) for name in names]
         )

@@ -207,7 +207,7 @@ def summary_of(
     """
     if not fused_records:
         return None
-    of = {name: _block(frames, bodies, names) for name, (frames, bodies) in fused_records.items()}
+    of = {name: _block(frames, tracks, names) for name, (frames, tracks) in fused_records.items()}
     together = of.pop(SWARM)
     return {**together, "terminals": of}
 

@@ -548,14 +548,14 @@ class Scenario(Node):
             for name, uav in active.items()
             if uav.resource_block is not None
         }
-        taken = {block + i for block in out.values() for i in range(self.radio.groups)}
+        occupied = {block + i for block in out.values() for i in range(self.radio.groups)}
         for name in active:
             if name not in out:
                 block = 0
-                while taken & set(range(block, block + self.radio.groups)):
+                while occupied & set(range(block, block + self.radio.groups)):
                     block += 1
                 out[name] = block
-                taken |= set(range(block, block + self.radio.groups))
+                occupied |= set(range(block, block + self.radio.groups))
         return {name: out[name] for name in active}
 
     def _rcs_problems(self) -> Iterator[Problem]:

@@ -176,9 +176,9 @@ class Auto:
         faint = ~every
         if self.below_noise and tones.size:
             limit = self.below_noise * self.noise_power / size
-            faint = ~tones.sight & _below_noise(waveform, tones, limit)
+            faint = ~tones.is_los & _below_noise(waveform, tones, limit)
         top = _strongest(tones.power, self.max_direct)
-        alone = ~faint & ((strong & top) | tones.sight | (error > GRIDDED_ERROR))
+        alone = ~faint & ((strong & top) | tones.is_los | (error > GRIDDED_ERROR))
         if (~alone).sum() * elements <= GRID_PATHS * -(-elements // LANES):
             return every, ~every
         return alone, faint

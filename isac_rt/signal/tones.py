@@ -23,7 +23,7 @@ class Tones(NamedTuple):
     Attributes
     ----------
     link : (K,) int64
-    sight : (K,) bool, lines of sight
+    is_los : (K,) bool, lines of sight
     power : (K,) received power [W]
     factor : (K,) complex128, conj(path gain)
     delay, rate, accel : (K,) float64, the clock of the transmitter included
@@ -39,7 +39,7 @@ class Tones(NamedTuple):
     """
 
     link: np.ndarray
-    sight: np.ndarray
+    is_los: np.ndarray
     power: np.ndarray
     factor: np.ndarray
     delay: np.ndarray
@@ -110,7 +110,7 @@ def tones_of(
     parts = [
         dict.fromkeys(set(Tones._fields) - {"tx_gain", "rx_gain"}, none)
         | {"link": none.astype(np.int64), "cross_row": none.astype(np.int64)}
-        | {"sight": none.astype(bool), "factor": none.astype(complex)}
+        | {"is_los": none.astype(bool), "factor": none.astype(complex)}
         | {"tx_delay": np.zeros((0, num_tx)), "rx_delay": np.zeros((0, len(rx)))}
         | {"cross": np.zeros((1, num_tx, len(rx))), "symbol_delay": np.zeros((0, *grid))}
         | {"send": np.zeros((0, *grid), complex), "antenna": np.zeros((0, *grid), np.int64)}
@@ -119,8 +119,8 @@ def tones_of(
     for q, (t, s) in enumerate(links):
         tx = np.zeros((num_tx, 3))
         tx[: t.antennas.num_tx] = t.pose.to_world(t.antennas.tx_positions)
-        sight = s.kind == PathKind.LINE_OF_SIGHT
-        near = np.flatnonzero(sight & np.isfinite(s.rx_radius))
+        is_los = s.kind == PathKind.LINE_OF_SIGHT
+        near = np.flatnonzero(is_los & np.isfinite(s.rx_radius))
         row = np.zeros(len(s), np.int64)
         row[near] = rows + np.arange(near.size)
         rows += near.size
@@ -134,7 +134,7 @@ def tones_of(
         parts.append(
             {
                 "link": np.full(len(s), q, np.int64),
-                "sight": sight,
+                "is_los": is_los,
                 "power": t.amplitude**2 * s.power,
                 "factor": s.gain.conj(),
                 "delay": moved + t.clock_offset + (t.first_block - first_block) * w.group_spacing,

@@ -129,7 +129,7 @@ def make_plan(setup: Setup) -> dict[str, Any]:
     items = [_tracing_item(setup, frames), *_scene_items(setup)]
     for link, of_link in uses.items():
         items += _link_items(setup, link, of_link)
-    items += _standing_items(setup, light, late, short_lived / len(frames))
+    items += _unmodelled_items(setup, light, late, short_lived / len(frames))
     items += [] if setup.has_ideal_hardware else _hardware_items(last)
     items += _self_calibration_items(setup, last)
     return {
@@ -154,7 +154,7 @@ def _late(setup: Setup, paths: PathSet, noise_power: float) -> float:
     return power * setup.plan.cell_noise_gain(paths.tx) / noise_power
 
 
-def _standing_items(setup: Setup, light: float, late: float, short_lived: float) -> list[Item]:
+def _unmodelled_items(setup: Setup, light: float, late: float, short_lived: float) -> list[Item]:
     """Return the items of effects that no run models: phases [rad], power over the noise of a cell,
     paths per frame."""
     limit = f"paths longer than {_next_slot(setup) * SPEED_OF_LIGHT:.0f} m"
@@ -233,18 +233,18 @@ def _tracing_item(setup: Setup, frames: Sequence[int]) -> Item:
 def _scene_items(setup: Setup) -> list[Item]:
     """Return the items of the mesh and its scatterers."""
     out, record = [], extent(setup.city, setup.propagation.census(), setup.scenario.clutter)
-    faces, gone = record["city_faces"], record["city_faces_beyond_reach"]
-    if faces + gone:
+    faces, dropped = record["city_faces"], record["city_faces_beyond_reach"]
+    if faces + dropped:
         whole = setup.plan.preset == "everything" or setup.scenario.access.establish
-        why = f"{gone} faces out of reach, {setup.plan.reach:.0f} m by the IF filter"
+        why = f"{dropped} faces out of reach, {setup.plan.reach:.0f} m by the IF filter"
         out.append(Item("mesh", f"{faces} faces", "nothing" if whole else why))
     if (count := record["scatterers"]) is not None:
-        hidden = record["scatterer_cells"] - count
+        unseen = record["scatterer_cells"] - count
         density = f"{record['cell_area_per_metre_m']:.3g} m2 and metre from the flights"
         said, why = f"{count} scatterers, one for {density}", "cells that no transmitter sees"
         error, again = record["clutter_error_db"], record["overlap_m2"]
         why += f"; {again:.0f} m2 that lie twice, for surfaces overlap" if again else ""
-        out.append(Item("clutter field", said, f"{hidden} {why}", error, "dB of a cell's mean"))
+        out.append(Item("clutter field", said, f"{unseen} {why}", error, "dB of a cell's mean"))
         for link, left in record["merged"].items():
             below_noise = f"{count - left} merged under noise or out of sight"
             kept, unit = f"{left} scatterers", "dB of noise and clutter"
@@ -282,7 +282,7 @@ def _link_items(setup: Setup, link: Link, uses: list[Use]) -> list[Item]:
         f"{np.mean([use.kept.get(k, 0) for use in uses]):,.0f} {k.replace('_', ' ')}" for k in kinds
     )
     said = f"{kept or 'none'}; bounces: {max(use.bounces for use in uses)} at most"
-    gone = f"{mean['weak']:,.0f} too weak, {mean['filtered']:,.0f} out of reach"
+    dropped = f"{mean['weak']:,.0f} too weak, {mean['filtered']:,.0f} out of reach"
     left = decibels(min(POWER_MARGIN * max(use.left_out for use in uses), setup.plan.weakest))
     num_kept = max(mean["found"] - mean["filtered"] - mean["weak"], 1.0)
 
@@ -293,7 +293,7 @@ def _link_items(setup: Setup, link: Link, uses: list[Use]) -> list[Item]:
     method = setup.plan.synthesis(int(num_kept))
     error = 1e-6 if isinstance(method, Direct) else GRIDDED_ERROR
     return [
-        Item("paths", said, gone, left, "dB", name),
+        Item("paths", said, dropped, left, "dB", name),
         Item(
             "wavefronts",
             f"{num_kept - plane:,.0f} spherical",

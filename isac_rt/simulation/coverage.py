@@ -160,7 +160,7 @@ def _link_coverage(
     w, passes = timetable.waveform, link.passes
     cell, velocity, across, up = resolutions(w, antennas, passes).tolist()
     sideways, upwards = antennas.observes(passes)
-    unambiguous_span = antennas.turns(SPEED_OF_LIGHT / float(w.carrier()), passes)[0]
+    unambiguous_span = antennas.cosine_period(SPEED_OF_LIGHT / float(w.carrier()), passes)[0]
     return LinkCoverage(
         link=str(link),
         max_range_m=w.num_range_cells * cell,

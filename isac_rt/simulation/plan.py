@@ -146,8 +146,8 @@ class Plan:
             abs(u.clock_offset_s) + 1e-6 * abs(u.clock_drift_ppm) * last
             for u in self.swarm.uavs.values()
         )
-        skirt = w.filter_transition / w.slope
-        return w.max_delay + skirt + groups_between * w.group_spacing + clocks
+        transition = w.filter_transition / w.slope
+        return w.max_delay + transition + groups_between * w.group_spacing + clocks
 
     @property
     def reach(self) -> float:
@@ -266,10 +266,10 @@ def faintest(power: np.ndarray, cell: np.ndarray, limit: float) -> tuple[np.ndar
     starts = np.flatnonzero(np.diff(cells, prepend=cells[:1] - 1))
     before = np.where(starts > 0, sums[starts - 1], 0.0) if starts.size else sums
     total = sums - np.repeat(before, np.diff(starts, append=sums.size))
-    gone = total <= limit
+    dropped = total <= limit
     mask = np.zeros(len(power), bool)
-    mask[order] = gone
-    return mask, float(total[gone].max(initial=0.0))
+    mask[order] = dropped
+    return mask, float(total[dropped].max(initial=0.0))
 
 
 def plane_bound(paths: PathSet, antennas: Antennas, waveform: Waveform) -> np.ndarray:
@@ -322,9 +322,9 @@ def turning_bound(
         r = float(np.linalg.norm(positions, axis=1).max())
         flown = flown_distance[own] + np.where(paths.target >= 0, targets, flown_distance[other])
         flown = np.where(paths.kind == PathKind.DIFFUSE, flown_distance[own], flown)
-        room = radius - flown - r
+        rest = radius - flown - r
         # beside the UAV itself a direction may turn to the opposite one
-        out += k * np.where(room > flown / 2, r * flown / np.maximum(room, flown / 2), 2 * r)
+        out += k * np.where(rest > flown / 2, r * flown / np.maximum(rest, flown / 2), 2 * r)
         out += k * max(float(np.linalg.norm(at - here, axis=1).max()) for at in then)
     return np.where(paths.kind == PathKind.LEAKAGE, 0.0, out)
 

@@ -299,12 +299,12 @@ class Setup:
         if not any(std):
             return pose
         rng = generator(self.scenario.seed, "belief", name)
-        position, velocity, turn = np.array(std)[:, None] * rng.standard_normal((3, 3))
+        position, velocity, rotation_vector = np.array(std)[:, None] * rng.standard_normal((3, 3))
         return replace(
             pose,
             position=pose.position + position,
             velocity=pose.velocity + velocity,
-            rotation=Rotation.from_rotvec(turn).as_matrix() @ pose.rotation,
+            rotation=Rotation.from_rotvec(rotation_vector).as_matrix() @ pose.rotation,
         )
 
     @cached_property

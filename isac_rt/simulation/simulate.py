@@ -355,5 +355,5 @@ class _Run:
         stages = self.setup.connections.summary(self.setup.timetable.epoch(0))
         if not self.setup.scenario.access.feedback:
             return stages
-        told = {str(link): o.feedback for link, o in self.own.stations.items() if not link.own}
-        return (stages or {}) | {"feedback": told}
+        feedback = {str(link): o.feedback for link, o in self.own.stations.items() if not link.own}
+        return (stages or {}) | {"feedback": feedback}

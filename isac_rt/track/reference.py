@@ -138,7 +138,7 @@ class Reference(Stateful):
 
     def reported(self, state: Gaussian) -> Track:
         """Return the transmitter as its data report it (6,), as a track."""
-        self.state.report = Track.of_body(state, self._acceleration_std, self.state.time)
+        self.state.report = Track.of_state(state, self._acceleration_std, self.state.time)
         return self.state.report
 
     def forget(self, tracker: Tracker) -> None:

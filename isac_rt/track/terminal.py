@@ -347,11 +347,11 @@ class PassiveTerminal(Stateful):
         """Carry on the reflectors' tracks and start new ones, where the frame shows the transmitter
         or its data say where it is."""
         if reception.line_of_sight:
-            sight = self.reference.track
+            los = self.reference.track
         else:
-            sight = own.sender if own.over_other_path and reception.decoded else None
-        if sight is not None and reception.placed:
-            own = replace(own, reference=sight)
+            los = own.sender if own.over_other_path and reception.decoded else None
+        if los is not None and reception.placed:
+            own = replace(own, reference=los)
             follow(self.tracker, self.equipment.rules, in_plane(reception.detections), own)
 
     def shorten(self, cells: int, own_pose: Pose) -> None:

@@ -99,12 +99,13 @@ class Track:
     first_id: int = -1
 
     @classmethod
-    def of_body(cls, body: Gaussian, acceleration_std: float = 0.0, time: float = -np.inf) -> Track:
-        """A UAV that others say there is, with position and velocity (6,): a track that was never
-        born."""
-        mean = np.concatenate([body.mean, np.zeros(3)])
+    def of_state(
+        cls, state: Gaussian, acceleration_std: float = 0.0, time: float = -np.inf
+    ) -> Track:
+        """Track of a reported UAV with position and velocity (6,)."""
+        mean = np.concatenate([state.mean, np.zeros(3)])
         covariance = np.diag([0.0] * 6 + [acceleration_std**2] * 3)
-        covariance[:6, :6] = body.covariance
+        covariance[:6, :6] = state.covariance
         return cls(-1, Gaussian(mean, covariance), np.inf, confirmed=True, last=time)
 
 
@@ -252,8 +253,8 @@ class Tracker(Stateful):
             rows = [k for k, t in enumerate(self.tracks) if t.confirmed is confirmed]
             pairs = assign(cost[np.ix_(rows, free)])
             hit |= {rows[i]: free[j] for i, j in pairs}
-            taken = {free[j] for _, j in pairs}
-            free = [q for q in free if q not in taken]
+            assigned = {free[j] for _, j in pairs}
+            free = [q for q in free if q not in assigned]
         for k, track in enumerate(self.tracks):
             q = hit.get(k)
             track.sure += q is not None and bool(detections.starts[q])

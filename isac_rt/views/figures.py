@@ -94,7 +94,7 @@ def _name(ax: Axes, points: np.ndarray, names: Sequence[str]) -> None:
     assert figure is not None
     figure.draw_without_rendering()  # the layout decides where the points lie
     markers = ax.transData.transform(points)
-    letter, taken = matplotlib.rcParams["font.size"] * figure.dpi / 72, list[Bbox]()
+    letter, placed = matplotlib.rcParams["font.size"] * figure.dpi / 72, list[Bbox]()
     style = {"fc": "white", "ec": "none", "alpha": 0.7, "boxstyle": "round,pad=0.1"}
     for u, (name, here) in enumerate(zip(names, markers, strict=True)):
         size = np.array([0.8 * len(name), 1.2]) * letter
@@ -103,15 +103,15 @@ def _name(ax: Axes, points: np.ndarray, names: Sequence[str]) -> None:
         free = [
             box
             for box in boxes
-            if box.count_overlaps(taken) == 0
+            if box.count_overlaps(placed) == 0
             and not any(box.contains(*marker) for marker in markers)
             and ax.bbox.x0 <= box.x0 <= box.x1 <= ax.bbox.x1
         ]
-        taken.append((free or boxes)[0])
+        placed.append((free or boxes)[0])
         ax.annotate(
             name,
             points[u],
-            xytext=(taken[u].p0 - here) * 72 / figure.dpi,
+            xytext=(placed[u].p0 - here) * 72 / figure.dpi,
             textcoords="offset points",
             fontweight="bold",
             color=colour_of(u),
@@ -283,9 +283,9 @@ def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
         label = f"erased ({lost.sum()} of {data.sum()} frames)"
         ax.plot(t[lost], np.full(lost.sum(), 1.06), "x", color="#303030", ms=4, label=label)
     sender = list(dataset.uav.values).index(dataset.transmitter.values[observer])
-    hidden = dataset.occluded.values[:, observer, sender]
-    _shade(ax, t, hidden, "#303030")
-    if hidden.any():
+    occluded = dataset.occluded.values[:, observer, sender]
+    _shade(ax, t, occluded, "#303030")
+    if occluded.any():
         label = f"{dataset.transmitter.values[observer]} occluded"
         ax.plot([], [], "s", color="#303030", alpha=0.2, ms=7, mew=0, label=label)
     ax.set(ylim=(-0.04, 1.14), yticks=(0, 0.5, 1))

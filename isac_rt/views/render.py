@@ -39,7 +39,7 @@ FAR_DOWN_M = 1e4
 Below = Callable[[np.ndarray], float]
 _SUPERSAMPLING = 2
 _LINES_PER_KIND = 80
-_HIDDEN_ALPHA = 0.18
+_OCCLUDED_ALPHA = 0.18
 _PIECES = 48
 
 
@@ -129,7 +129,7 @@ def depth_buffer(
     return depth, face
 
 
-def is_hidden(points: np.ndarray, view: View, depth: np.ndarray, slack: float = 0.6) -> np.ndarray:
+def is_masked(points: np.ndarray, view: View, depth: np.ndarray, slack: float = 0.6) -> np.ndarray:
     """Return whether world points (..., 3) lie more than `slack` [m] behind the surface in the
     depth buffer."""
     height, width = depth.shape
@@ -159,7 +159,7 @@ def shade(city: CityMesh, view: View, width: int, height: int) -> tuple[np.ndarr
     reach = float(np.hypot(*view.half)) * 2
     sun = view_from(np.arctan2(SUN[0], SUN[1]), np.arcsin(SUN[2]), view.centre, (reach, reach))
     cast, _ = depth_buffer(corners, sun, 2048, 2048)
-    lit = ~is_hidden(points, sun, cast, slack=4 * reach / 2048 + 0.1)
+    lit = ~is_masked(points, sun, cast, slack=4 * reach / 2048 + 0.1)
     floor = float(np.quantile(corners[..., 2], 0.02)) + 1.0
     level = normal[..., 2:] > 0.9
     base = np.where(
@@ -195,7 +195,7 @@ def best_view(city: CityMesh, tracks: np.ndarray, aspect: float) -> View:
     ]
     return min(
         views,
-        key=lambda v: is_hidden(
+        key=lambda v: is_masked(
             tracks, v, depth_buffer(corners, v, 320, int(320 / aspect))[0]
         ).mean(),
     )
@@ -215,9 +215,9 @@ class _Picture:
         columns = [np.interp(s, np.arange(len(corners)), c) for c in corners.T]
         points = np.stack(columns, axis=1)
         flat = self.view.project(points)[:, :2]
-        hidden = is_hidden((points[1:] + points[:-1]) / 2, self.view, self.depth)
+        occluded = is_masked((points[1:] + points[:-1]) / 2, self.view, self.depth)
         pieces = list(np.stack([flat[:-1], flat[1:]], axis=1))
-        shown = np.where(hidden, _HIDDEN_ALPHA, 1.0) * alpha
+        shown = np.where(occluded, _OCCLUDED_ALPHA, 1.0) * alpha
         self.ax.add_collection(LineCollection(pieces, colors=colour, linewidths=width, alpha=shown))
 
     def paths(self, paths: Mapping[Link, PathSet], poses: Mapping[str, Pose]) -> list[Line2D]:
@@ -232,7 +232,7 @@ class _Picture:
                     [p.points[p.kind == kind].reshape(-1, 3) for p in paths.values()]
                 )
                 points = points[np.isfinite(points).all(axis=1)]
-                points = points[~is_hidden(points, self.view, self.depth)]
+                points = points[~is_masked(points, self.view, self.depth)]
                 x, y = self.view.project(points)[:, :2].T
                 self.ax.plot(x, y, ".", color=colour, ms=2.6, alpha=0.8, mew=0)
             elif kind != PathKind.LEAKAGE:

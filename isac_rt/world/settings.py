@@ -403,8 +403,8 @@ class Uav(Node):
                     "waypoints in the order of their times",
                 )
                 continue
-            way = math.dist(before.position_m, after.position_m)
-            if (speed := way / (after.time_s - before.time_s)) > MAX_SPEED_MPS:
+            distance = math.dist(before.position_m, after.position_m)
+            if (speed := distance / (after.time_s - before.time_s)) > MAX_SPEED_MPS:
                 yield Problem(
                     (("waypoints", i, "time_s"), ("waypoints", i, "position_m")), _too_fast(speed)
                 )

@@ -599,7 +599,7 @@ def test_points_ever_seen_are_those_seen_from_any_place():
     the last place is not looked from; a point once in the dark stays there."""
     city = load_city(scenario.City(source="blocks"), ".", F_C, np.zeros(3))
     model, _ = flown(city, (2.0, 3.0, 19.0), (9.0, 40.0, 25.0), cell_area_per_metre_m=9.0)
-    shadows, cells = model.field.sight.shadows, all_cells(city)
+    shadows, cells = model.field.visibility.los, all_cells(city)
     places = np.array([[2.0, 3.0, 19.0], [-31.0, 8.0, 44.0], [77.0, -60.0, 31.0]])
     normals = city.normals[cells.face]
     each = np.array([shadows.sees(place, cells.points, normals) for place in places])

@@ -99,9 +99,9 @@ def test_a_field_is_advanced_without_shooting_more_rays_per_frame():
                 clutter={"model": "field", "cell_area_per_metre_m": 1.0},
             )
         )
-        sight = tracer_of(setup).field.sight
-        sees, calls = sight.shadows.all_seen, []
-        sight.shadows.all_seen = lambda at, *args, sees=sees, calls=calls: (
+        sight = tracer_of(setup).field.visibility
+        sees, calls = sight.los.all_seen, []
+        sight.los.all_seen = lambda at, *args, sees=sees, calls=calls: (
             calls.extend(at),
             sees(at, *args),
         )[1]

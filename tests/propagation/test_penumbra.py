@@ -53,11 +53,11 @@ def test_sight_over_an_edge_is_fresnels_integral():
     near, far, between = [], [], 0
     for time in np.linspace(0.2, 0.65, 19):
         pose = flight.pose(time)
-        share = model.field.sight.share("A", pose, time)
+        share = model.field.visibility.share("A", pose, time)
         nu, expected = exact(pose.position, cells.points)
         off = np.abs(share - expected)
         # crossed within the run: the sight of others does not change, and stays as the rays say
-        stretches = model.field.sight._stretches.values()
+        stretches = model.field.visibility._stretches.values()
         crossed = np.unique(np.concatenate([c.index for s in stretches for c in s.crossed]))
         inner = np.zeros(len(cells), bool)
         inner[crossed] = True
@@ -81,16 +81,16 @@ def test_sight_does_not_know_the_frames_before():
     two, _ = flown(scene, **flight, cell_area_per_metre_m=0.02)
     times = [0.0, 0.11, 0.48, 0.52, 0.9, 0.993]
     poses = [swarm.trajectories["A"].pose(t) for t in times]
-    first = [one.field.sight.share("A", p, t) for p, t in zip(poses, times, strict=True)]
+    first = [one.field.visibility.share("A", p, t) for p, t in zip(poses, times, strict=True)]
     second = [
-        two.field.sight.share("A", p, t) for p, t in zip(poses[::-1], times[::-1], strict=True)
+        two.field.visibility.share("A", p, t) for p, t in zip(poses[::-1], times[::-1], strict=True)
     ][::-1]
     for a, b in zip(first, second, strict=True):
         assert np.array_equal(a, b)
     middle = first[2]
     assert ((middle > 0.05) & (middle < 0.95)).sum() > 50
     beside = replace(poses[2], position=poses[2].position + np.array([0.0, 0.0, 0.3]))
-    assert set(np.unique(one.field.sight.share("A", beside, times[2]))) == {
+    assert set(np.unique(one.field.visibility.share("A", beside, times[2]))) == {
         0.0,
         1.0,
     }  # off the flight rays alone decide
@@ -101,8 +101,8 @@ def powers(model, flight, city, times, lift: float = 0.02):
     sight: the exact knife edge at the pose (by the edge of the shortest detour), rays alone, the
     field's, and a blend of rays over two metres; and the squares of the last three's errors of
     amplitude in the penumbra."""
-    field, sight = model.field, model.field.sight
-    edges, out, apart = ShadowEdges(city, sight.shadows, LAMBDA), [], []
+    field, sight = model.field, model.field.visibility
+    edges, out, apart = ShadowEdges(city, sight.los, LAMBDA), [], []
     for time in times:
         pose = flight.pose(time)
         place = pose.position - city.origin
@@ -112,7 +112,7 @@ def powers(model, flight, city, times, lift: float = 0.02):
         n = city.normals[cells.face]
         front = (span * n).sum(1)
         weight = cells.area * (front / r) ** 2 / r**4
-        rays = sight.shadows.sees(place, cells.points, n).astype(float)
+        rays = sight.los.sees(place, cells.points, n).astype(float)
         # what faces away is dark, though a ray from its inner side may bend
         asked = np.flatnonzero((front > 0) | (rays > 0))
         lifted = cells.points[asked] + lift * np.sign(front[asked])[:, None] * n[asked]
@@ -121,7 +121,7 @@ def powers(model, flight, city, times, lift: float = 0.02):
         truth[asked] = np.where(np.isinf(nu), nu < 0, np.abs(edge_factor(np.clip(nu, -30, 30))))
         blend = np.zeros(len(cells))
         for time_sample, share in sight.flights["A"].blend(time).items():
-            blend += share * sight.shadows.sees(
+            blend += share * sight.los.sees(
                 sight.flights["A"].time_samples[time_sample], cells.points, n
             )
         ours = sight.share("A", replace(pose, position=place), time)

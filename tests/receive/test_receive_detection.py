@@ -95,7 +95,7 @@ def test_method_follows_the_schedule():
 
     def way(method: str, w: Waveform, slots: np.ndarray) -> type:
         sent = Known.unmodulated(w, slots, ANTENNAS, 2)
-        return type(passive_detector_of(Receivers(velocity_method=method)).way(sent))
+        return type(passive_detector_of(Receivers(velocity_method=method)).doppler_method(sent))
 
     assert way("auto", Waveform(), schedule) is LatinUnion
     assert way("auto", two, schedule[:2]) is Omp

@@ -55,7 +55,7 @@ def above(signal: IFCube, payload, settings: Receivers) -> np.ndarray:
         passive_detector_of(settings),
         known(signal.waveform, signal.schedule, payload, FEW, 1),
     )
-    power = detector.way(sent).power(clean_spectrum(signal, sent), sent)
+    power = detector.doppler_method(sent).power(clean_spectrum(signal, sent), sent)
     return detector.rule(sent).detect(power)[0]
 
 

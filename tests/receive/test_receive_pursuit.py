@@ -15,7 +15,7 @@ from isac_rt.receive import pursuit
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.chain import passive_detector_of
 from isac_rt.receive.estimate import Estimate, LocalSpectra
-from isac_rt.receive.pursuit import Pursuit, _add, _Path, _take_out
+from isac_rt.receive.pursuit import Pursuit, _add, _Path, _subtract
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 
@@ -83,7 +83,7 @@ def test_a_path_is_taken_out_whole_and_put_back(passes: int):
     )
     assert np.abs(np.abs(turned) - abs(path.amplitude)).max() < 0.02
     left, whole = spectra.copy(), _Path(exact, 1.0, 1.0)
-    _take_out(left, whole, chirps, 1e-12)
+    _subtract(left, whole, chirps, 1e-12)
     assert whole.rows[1] - whole.rows[0] == 49
     assert (
         np.abs(left).max() < 3e-3 * np.abs(spectra).max()
@@ -94,7 +94,7 @@ def test_a_path_is_taken_out_whole_and_put_back(passes: int):
     power = np.abs(left) ** 2
     noise = 1e-4 * float(power.max())
     less = _Path(exact, float(power.max()), 1.0)
-    _take_out(left, less, chirps, noise)
+    _subtract(left, less, chirps, noise)
     assert less.rows[1] - less.rows[0] < 29
     outside = np.ones(len(left[0, 0]), bool)
     outside[slice(*less.rows)] = False

@@ -72,7 +72,9 @@ def test_method_follows_the_schedule():
 def way(settings: Receivers, schedule: np.ndarray) -> type:
     """How the map of a frame with this schedule is made."""
     w = Waveform(num_groups=len(schedule))
-    return type(passive_detector_of(settings).way(Known.unmodulated(w, schedule, FEW, 2)))
+    return type(
+        passive_detector_of(settings).doppler_method(Known.unmodulated(w, schedule, FEW, 2))
+    )
 
 
 def test_conventional_map_is_each_antennas_own_transform():

@@ -19,7 +19,7 @@ from isac_rt.receive.maps import channel_maps, power_map
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.results.labels import MapPositions, hann_response
-from isac_rt.results.losses import Chance, Channels, Loss, Sensitivity, cause_of, single_look
+from isac_rt.results.losses import Chance, Channels, Loss, Sensitivity, cause_of, coherent_detection
 from isac_rt.world.swarm import Pose
 
 W = Waveform(num_samples=128, num_chirps=24)
@@ -403,13 +403,13 @@ def test_what_a_matched_filter_and_a_beam_would_find():
         noise = rng.normal(size=draws) + 1j * rng.normal(size=draws)
         found = (np.abs(np.sqrt(2 * snr) + noise) ** 2 / 2 > -np.log(1e-4)).mean()
         allowed = 4 * np.sqrt(found * (1 - found) / draws)
-        assert single_look(snr, 1e-4) == pytest.approx(found, abs=allowed)
-    assert single_look(10**1.31, 1e-6) == pytest.approx(0.9, abs=0.02)  # good to 0.2 dB
-    assert SEES.genie(10**1.31) == single_look(10**1.31, 1e-6)
+        assert coherent_detection(snr, 1e-4) == pytest.approx(found, abs=allowed)
+    assert coherent_detection(10**1.31, 1e-6) == pytest.approx(0.9, abs=0.02)  # good to 0.2 dB
+    assert SEES.genie(10**1.31) == coherent_detection(10**1.31, 1e-6)
     assert SEES.clutter_free(0.4) == SEES.detection_probability(0.4)
     w, schedule, payload = frame(waveform=W)
     city = Receivers(clutter_detector="angle_doppler", update_false_alarm_rate=1e-4)
     for own in (False, True):
         sees = Sensitivity.of(w, ANTENNAS, city, sent(schedule, payload), 1.0, 3, own)
-        expected = single_look(0.2 * 45, 1e-4) if own else sees.detection_probability(0.2)
+        expected = coherent_detection(0.2 * 45, 1e-4) if own else sees.detection_probability(0.2)
         assert sees.clutter_free(0.2) == expected

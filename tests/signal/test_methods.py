@@ -35,7 +35,7 @@ def test_sights_and_fast_paths_go_one_by_one_whatever_their_power():
     rate = np.zeros(40)
     rate[7] = 2 * 80.0 / SPEED_OF_LIGHT
     rate[8] = 2 * 40.0 / SPEED_OF_LIGHT
-    w, t = tones_of(40, rate=rate, sight=np.arange(40) == 3)
+    w, t = tones_of(40, rate=rate, is_los=np.arange(40) == 3)
     alone, _ = Auto(noise_power=1.0).choose(w, t)
     assert np.flatnonzero(alone).tolist() == [3, 7]
 

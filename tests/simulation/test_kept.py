@@ -73,7 +73,7 @@ def prepared(folder: Path, change: dict) -> bytes:
     cells = [vars(field.of(link).cells) for link in [*field.merged, ("no", "link")]]
     time, at = setup.timetable.epoch(5), setup.swarm.poses(setup.timetable.epoch(5))
     shares = [
-        field.of(link).sight.share(name, in_local(at[name], setup.city.origin), time)
+        field.of(link).visibility.share(name, in_local(at[name], setup.city.origin), time)
         for link in field.merged
         for name in link
     ]

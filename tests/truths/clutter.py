@@ -236,7 +236,7 @@ def sight_alone_changes_no_range_cell_at_once() -> float:
     for time in (np.arange(round(5.0 / FRAME)) + 0.5) * FRAME:
         pose, seen = flight.pose(time), flight.seen(time)
         share, waves, mean = (
-            flight.field.sight.share("A", pose, time),
+            flight.field.visibility.share("A", pose, time),
             np.zeros(len(cells), complex),
             np.zeros(len(cells)),
         )

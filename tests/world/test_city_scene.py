@@ -153,7 +153,7 @@ def test_scattering_patterns_reach_sionna():
 def test_shadow_rays_meet_the_faces_that_sionnas_do():
     """Of random rays in a street, those of the scene without materials are stopped as Sionna's are,
     and the latter is made only when it is asked for. Seen failing with the roofs left out."""
-    from isac_rt.propagation.segments.rays import Shadows
+    from isac_rt.propagation.segments.rays import LosTest
     from isac_rt.world.city import scene as scenes
 
     city = load_city(
@@ -163,7 +163,7 @@ def test_shadow_rays_meet_the_faces_that_sionnas_do():
     draw = np.random.default_rng(31)
     low, high = city.corners.min(axis=(0, 1)), city.corners.max(axis=(0, 1))
     starts, ends = draw.uniform(low, high + 3, (2, 4000, 3))
-    clear = Shadows(made.faces).clear(starts, ends)
+    clear = LosTest(made.faces).clear(starts, ends)
     assert "solved" not in vars(made)
     assert 400 < clear.sum() < 3600
-    assert (clear == Shadows(made.solved.scene.mi_scene).clear(starts, ends)).all()
+    assert (clear == LosTest(made.solved.scene.mi_scene).clear(starts, ends)).all()

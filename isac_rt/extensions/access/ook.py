@@ -62,16 +62,16 @@ def needed_chirps(num_chirps: int, false_rate: float) -> int:
     return int(np.flatnonzero(tail <= false_rate)[0])
 
 
-def choose_run(taken: np.ndarray, length: int, wished: int | None = None) -> int | None:
+def choose_run(occupied: np.ndarray, length: int, wished: int | None = None) -> int | None:
     """First block of a free run: the wished one, else the free start nearest to it (the lower of
     two); without a wish the lowest.
 
     Parameters
     ----------
-    taken : (blocks,) bool
+    occupied : (blocks,) bool
     length : consecutive blocks needed; a run does not wrap around the slot
     """
-    starts = [b for b in range(len(taken) - length + 1) if not taken[b : b + length].any()]
+    starts = [b for b in range(len(occupied) - length + 1) if not occupied[b : b + length].any()]
     if not starts:
         return None
     return min(starts, key=lambda b: (abs(b - (wished or 0)), b))

@@ -264,10 +264,10 @@ def establish(network: Network) -> Establishment:
     missed: dict[str, int] = {}
     false: dict[str, int] = {}
     for at, wish in network.wishes.items():
-        taken = _listen(air, at)
+        busy = _listen(air, at)
         truth = _occupied(air)
-        missed[at], false[at] = int((truth & ~taken).sum()), int((taken & ~truth).sum())
-        block = choose_run(taken, network.waveform.num_groups, wish)
+        missed[at], false[at] = int((truth & ~busy).sum()), int((busy & ~truth).sum())
+        block = choose_run(busy, network.waveform.num_groups, wish)
         if block is None:
             links |= {
                 Link(at, pt): LinkState(None, None, False, None, False, False)
@@ -309,12 +309,12 @@ def _occupied(air: _Air) -> np.ndarray:
 def _listen(air: _Air, at: str) -> np.ndarray:
     """Blocks that an active terminal receives somebody in, (blocks,) bool."""
     w = air.n.waveform
-    taken = np.zeros(w.num_resource_blocks, bool)
-    for first in scan(taken.size, w.num_groups):
+    busy = np.zeros(w.num_resource_blocks, bool)
+    for first in scan(busy.size, w.num_groups):
         hot = hot_chirps(air.received(at, first).samples)
-        taken[first : first + w.num_groups] |= hot >= needed_chirps(w.num_chirps, BLOCK_FALSE_RATE)
+        busy[first : first + w.num_groups] |= hot >= needed_chirps(w.num_chirps, BLOCK_FALSE_RATE)
         air.frame += 1
-    return taken
+    return busy
 
 
 def _join(air: _Air, at: str, block: int) -> dict[Link, LinkState]:
@@ -413,20 +413,20 @@ def _first_round(
     return out
 
 
-def _turns(pts: Sequence[str], width: int) -> list[list[tuple[int, str]]]:
+def _rounds(pts: Sequence[str], width: int) -> list[list[tuple[int, str]]]:
     """(group, passive terminal) of each frame in which they answer."""
     return [list(enumerate(pts[first : first + width])) for first in range(0, len(pts), width)]
 
 
 def _answers(
     air: _Air,
-    turn: Sequence[tuple[int, str]],
+    answering: Sequence[tuple[int, str]],
     understood: Mapping[str, int],
     bits: Mapping[str, np.ndarray],
 ) -> list[Transmission]:
     """Transmissions of those of a turn that have something to answer, each in its group alone."""
     w, out = air.n.waveform, []
-    for group, pt in turn:
+    for group, pt in answering:
         if pt not in understood:
             continue
         mask = keyed(w, bits[pt]) if pt in bits else np.ones((w.num_groups, w.num_chirps), bool)
@@ -440,9 +440,9 @@ def _second_round(
 ) -> dict[str, Round | None]:
     """The passive terminals' unmodulated answers at the active one."""
     w, out = air.n.waveform, {}
-    for turn in _turns(pts, w.num_groups):
-        cube = air.received(at, block, _answers(air, turn, understood, {}))
-        for group, pt in turn:
+    for answering in _rounds(pts, w.num_groups):
+        cube = air.received(at, block, _answers(air, answering, understood, {}))
+        for group, pt in answering:
             if pt in understood:
                 found = _line_of_sight(air, cube.of_groups([group]), Link(pt, at))
                 # it answers on its own grid, whole blocks late by the other one's, as both know
@@ -459,9 +459,9 @@ def _acknowledge(
     n = air.n
     words = {pt: n.codebook.encode(Message(n.names.index(pt), block)) for pt in pts}
     out = set()
-    for turn in _turns(pts, n.waveform.num_groups):
-        cube = air.received(at, block, _answers(air, turn, understood, words))
-        for group, pt in turn:
+    for answering in _rounds(pts, n.waveform.num_groups):
+        cube = air.received(at, block, _answers(air, answering, understood, words))
+        for group, pt in answering:
             got = read(cube.samples[group : group + 1], n.codebook.num_bits)
             if got.found and n.codebook.decode(got.bits) == Message(n.names.index(pt), block):
                 out.add(pt)

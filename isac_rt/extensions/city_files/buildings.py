@@ -266,16 +266,16 @@ def _without_parts(found: list[Outline], parts: list[Outline], notes: list[str])
     covered = Counter[int]()
     for whole, part in zip(outer.tolist(), inside.tolist(), strict=True):
         covered[whole] += area[part]
-    gone = {i for i, of in covered.items() if of >= REPLACED_SHARE * shapes[i].area}
-    if gone:
-        used = sum(whole in gone for whole in outer.tolist())
-        notes.append(f"{len(gone)} buildings drawn by their {used} parts")
-    if len(covered) > len(gone):
+    replaced = {i for i, of in covered.items() if of >= REPLACED_SHARE * shapes[i].area}
+    if replaced:
+        used = sum(whole in replaced for whole in outer.tolist())
+        notes.append(f"{len(replaced)} buildings drawn by their {used} parts")
+    if len(covered) > len(replaced):
         notes.append(
-            f"{len(covered) - len(gone)} buildings whose parts cover less than half of them stand "
-            "beside their parts"
+            f"{len(covered) - len(replaced)} buildings whose parts cover less than half of them "
+            "stand beside their parts"
         )
-    return [outline for i, outline in enumerate(found) if i not in gone]
+    return [outline for i, outline in enumerate(found) if i not in replaced]
 
 
 def moved(outline: Outline, shape: shapely.Geometry) -> Outline:

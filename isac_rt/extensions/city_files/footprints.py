@@ -159,15 +159,15 @@ def _ground(
     if relief:
         return of_relief(relief)
     _, feet = feet_of(model.solids)
-    stand = [(*shapely.get_coordinates(o.shape.centroid)[0], o.foot) for o in _standing(model)]
-    feet = np.concatenate([feet, np.array(stand, dtype=np.float64).reshape(-1, 3)])
+    centres = [(*shapely.get_coordinates(o.shape.centroid)[0], o.foot) for o in _grounded(model)]
+    feet = np.concatenate([feet, np.array(centres, dtype=np.float64).reshape(-1, 3)])
     if len(feet):
         return ground_through(plan, feet, notes)
     lowest = min((float(solid.vertices[:, 2].min()) for solid in model.solids), default=0.0)
     return flat(plan, lowest if model.solids else -geo.origin[2])
 
 
-def _standing(model: CityModel) -> list[Outline]:
+def _grounded(model: CityModel) -> list[Outline]:
     return [outline for outline in model.outlines if outline.foot is not None]
 
 

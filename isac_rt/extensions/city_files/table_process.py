@@ -49,7 +49,7 @@ def _limit(kind: int, value: int) -> None:
     resource.setrlimit(kind, (value, value))
 
 
-def _taken() -> int:
+def _data_bytes() -> int:
     """Memory that this process has asked for. [bytes]"""
     try:
         with open("/proc/self/status") as status:
@@ -149,7 +149,7 @@ def main() -> None:
     try:
         # what this takes of memory and time does not count
         importlib.import_module("geopandas" if driver == "Parquet" else "pyogrio.raw")
-        _limit(resource.RLIMIT_DATA, _taken() + memory)
+        _limit(resource.RLIMIT_DATA, _data_bytes() + memory)
         _limit(resource.RLIMIT_CPU, int(time.process_time()) + seconds)
         data = _source(files)
         found = _by_arrow(data) if driver == "Parquet" else _by_gdal(driver, data, request["layer"])

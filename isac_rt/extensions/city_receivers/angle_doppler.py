@@ -304,10 +304,10 @@ def in_sidelobe(
     `first`, the transmitter's leakage, in all spans of velocities in which it shows; a map of all
     range cells has the last row beside the first."""
     row, column = np.unravel_index(power[:first].argmax(), power[:first].shape)
-    apart, span = rows - row, power.shape[1] // len(known.leaks)
+    row_offset, span = rows - row, power.shape[1] // len(known.leaks)
     if len(power) == known.waveform.num_samples:
-        apart = np.minimum(apart % len(power), -apart % len(power))
-    lobes = leaked(apart, (bins - column) % span, span, UNION_FLOOR)
+        row_offset = np.minimum(row_offset % len(power), -row_offset % len(power))
+    lobes = leaked(row_offset, (bins - column) % span, span, UNION_FLOOR)
     return np.asarray(power[rows, bins] <= LOBE_MARGIN * power[row, column] * lobes)
 
 

@@ -50,7 +50,7 @@ from isac_rt.receive.estimate import (
 )
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import UNION_FLOOR
-from isac_rt.receive.pursuit import RESIDUAL_DB, BySchedule, take_strong
+from isac_rt.receive.pursuit import RESIDUAL_DB, BySchedule, extract_strong
 from isac_rt.receive.sense import Sensed, describe
 from isac_rt.receive.types import NO_HINTS, Detections, ExpectedClutter, Hints
 
@@ -69,7 +69,7 @@ class BeamSearch(BySchedule):
         if not known.full:
             return super().sense(spectra, known, hints)
         clutter = hints.clutter
-        strong, snr, power, left, maps, rest = take_strong(spectra, known, self.settings)
+        strong, snr, power, left, maps, rest = extract_strong(spectra, known, self.settings)
         _, level = self.rule(known).detect(power)
         left_over = Remainder.of(strong, snr, known, rest.shape)
         noise, expected = self._noise(rest, known, clutter)

@@ -97,7 +97,7 @@ class Ghosts(TrackRule):
             if t.id in confirmed - new and self._walls.within(t.state.mean[:3], CROSSING_M)
         }
         asked = np.isin(tracks.ids, [*(new | crossing)]) & ~tracks.is_reference
-        reports = [Track.of_body(body.state) for body in own.reports]
+        reports = [Track.of_state(target.state) for target in own.reports]
         others = track_set(reports, own.pose, own.reference)
         single = (
             (tracks.detection >= 0) & self._alone[tracks.detection] if self._alone.size else None
@@ -119,19 +119,19 @@ class Leeway:
     resolution : (4,) range [m], velocity [m/s], u_x, u_z, of `frame.antennas.resolutions`; of one
         pass at a passive terminal
     ambiguity : of range and velocity
-    turns : of `Antennas`: an image may stand beyond the view
+    cosine_period : of `Antennas`: an image may stand beyond the view
     """
 
     resolution: np.ndarray
     ambiguity: Ambiguity
-    turns: np.ndarray | float = np.inf
+    cosine_period: np.ndarray | float = np.inf
 
     @classmethod
     def of(cls, waveform: Waveform, antennas: Antennas, passes: int) -> Leeway:
         """At an active terminal (2 passes) or a passive one (1)."""
         cells = resolutions(waveform, antennas, passes)
-        turns = antennas.turns(waveform.wavelength, passes)
-        return cls(cells, Ambiguity.of(waveform, passes), turns)
+        cosine_period = antennas.cosine_period(waveform.wavelength, passes)
+        return cls(cells, Ambiguity.of(waveform, passes), cosine_period)
 
     def explained(
         self, off: np.ndarray, std: np.ndarray, one_way: bool | np.ndarray = False
@@ -140,7 +140,7 @@ class Leeway:
         deviations and whether they are of an active terminal's echo over a wall on `one_way` (...).
         """
         off = wrapped(off, self.ambiguity)
-        off[..., 2:] = folded(off[..., 2:], self.turns)
+        off[..., 2:] = folded(off[..., 2:], self.cosine_period)
         share = np.where(np.asarray(one_way)[..., None], ONE_WAY_SHARE, RESOLUTION_SHARE)
         share = np.where([False, False, True, True], share, RESOLUTION_SHARE)
         allowed = DEVIATIONS * std + share * self.resolution
@@ -208,7 +208,7 @@ def suspicion(
     sender = tracks.mean[tracks.is_reference][0] if tracks.is_reference.any() else None
     seen_from = [own.position] if sender is None else [own.position, own.position + sender[:3]]
     for k in np.flatnonzero(~tracks.is_reference if asked is None else asked):
-        out.behind[k] = hidden_by(
+        out.behind[k] = occluded_by(
             own.position + tracks.mean[k, :3],
             tracks.covariance[k, :3, :3],
             seen_from,
@@ -233,9 +233,9 @@ def suspicion(
         may_be &= tracks.snr <= ECHO_WAVES * known.snr[s] * _weaker(known, s, sender, tracks.range)
         if known is reported:  # a track of the UAV itself is no echo of it
             may_be &= ~leeway.explained(measured - reported.measured[s], std)
-        faces, orders, ways = (np.array(of) for of in zip(*shown, strict=True))
+        faces, orders, paths = (np.array(of) for of in zip(*shown, strict=True))
         one_way = (orders == 1) & (sender is None)
-        hit = leeway.explained(measured[:, None] - ways, std[:, None], one_way) & may_be[:, None]
+        hit = leeway.explained(measured[:, None] - paths, std[:, None], one_way) & may_be[:, None]
         if single is not None:
             hit &= ~(single[:, None] & one_way)
         which, new = hit.argmax(axis=1), hit.any(axis=1) & (out.mirrored < 0)
@@ -278,13 +278,13 @@ def echoes(
     both ways, points then is left open: at the UAV, at the image or midway.
     """
     here = np.concatenate([own.position, own.velocity])
-    body = state + here
-    direct, out = measure(body, own), []
-    for face, image in _images(body, here, walls, reach):
+    target = state + here
+    direct, out = measure(target, own), []
+    for face, image in _images(target, here, walls, reach):
         mirrored = measure(image, own)
         middle = (direct + mirrored) / 2
         out += [
-            (face, 1, np.concatenate([middle[:2], way[2:]])) for way in (direct, mirrored, middle)
+            (face, 1, np.concatenate([middle[:2], path[2:]])) for path in (direct, mirrored, middle)
         ]
         out += [(face, 2, mirrored)]
     return out
@@ -306,31 +306,31 @@ def reflections(
     wave comes from the UAV, or from its image in the last wall.
     """
     here = np.concatenate([own.position, own.velocity])
-    body = state + here
-    back = [(-1, body), *_images(body, here, walls, reach)]
+    target = state + here
+    back = [(-1, target), *_images(target, here, walls, reach)]
     if sender is None:
         return [(face, 1, measure(image, own)) for face, image in back[1:]]
     start, out = sender + here, []
     received = [(face, measure(seen, own)) for face, seen in back]
-    for first, image in [(-1, body), *_images(body, start, walls, reach)]:
-        way = np.append(lengths(image[None], start)[0], [0.0, 0.0])
+    for first, image in [(-1, target), *_images(target, start, walls, reach)]:
+        path = np.append(lengths(image[None], start)[0], [0.0, 0.0])
         for last, seen in received:
             order = (first >= 0) + (last >= 0)
             if order:
-                out.append((first if first >= 0 else last, order, seen + way))
+                out.append((first if first >= 0 else last, order, seen + path))
     return out
 
 
 def _images(
-    body: np.ndarray, end: np.ndarray, walls: Walls, reach: float
+    target: np.ndarray, end: np.ndarray, walls: Walls, reach: float
 ) -> list[tuple[int, np.ndarray]]:
     """Mirror images (6,) of a UAV (6,) in the walls that show it to an end (6,) within reach [m],
     world coordinates, with the walls' faces."""
-    mirrors, images = walls.images(body, end, reach, MEETING)
+    mirrors, images = walls.images(target, end, reach, MEETING)
     return [(int(walls.mirrors[0][k]), image) for k, image in zip(mirrors, images, strict=True)]
 
 
-def hidden_by(
+def occluded_by(
     place: np.ndarray,
     covariance: np.ndarray,
     seen_from: list[np.ndarray],

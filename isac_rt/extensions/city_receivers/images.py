@@ -49,7 +49,7 @@ class Images(TrackRule):
         cells = np.array([waveform.range_cell(passes), waveform.velocity_cell(passes)])
         self._beside = MAIN_LOBE * cells
         self._beam = resolutions(waveform, antennas, 1)[2:]
-        self._turns = antennas.turns(waveform.wavelength, passes)
+        self._cosine_period = antennas.cosine_period(waveform.wavelength, passes)
 
     def candidates(self, detections: Detections, own: Own) -> Detections:
         d = detections
@@ -74,7 +74,7 @@ class Images(TrackRule):
         off = np.abs(wrapped(d.measured[:, None, :2] - shown[:, :2], self._ambiguity))
         beside = (off < self._beside).all(axis=-1)
         if self._passes == 1:
-            away = np.abs(folded(d.direction[:, None] - shown[:, 2:], self._turns))
+            away = np.abs(folded(d.direction[:, None] - shown[:, 2:], self._cosine_period))
             beside &= (away < self._beam + ALIAS_DEVIATIONS * d.std[:, None, 2:]).all(axis=-1)
         return np.asarray(beside.any(axis=1))
 
@@ -171,9 +171,9 @@ def met(
     for i in first:
         s = normals[i] @ start - offsets[i]
         once = mirror_image(start, normals[i], offsets[i])
-        apart, beyond = ((once - end) ** 2).sum(), normals[last] @ once - offsets[last]
+        base2, beyond = ((once - end) ** 2).sum(), normals[last] @ once - offsets[last]
         longer = 4 * beyond * before
-        some = (longer > max((2 * LEAST_RANGE) ** 2 - apart, 0)) & (longer < reach**2 - apart)
+        some = (longer > max((2 * LEAST_RANGE) ** 2 - base2, 0)) & (longer < reach**2 - base2)
         some &= last != i
         j, share = last[some], (beyond[some] / (beyond[some] + before[some]))[:, None]
         at_j = mirror_image(once, normals[j], offsets[j])

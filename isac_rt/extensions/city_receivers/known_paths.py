@@ -108,9 +108,9 @@ def _nearest(
     cells = np.array([w.range_cell(2), w.velocity_cell(2)])
     for i, measured in enumerate(measured_paths):
         found = np.array([measured.delay, measured.delay_rate]) * SPEED_OF_LIGHT / 2
-        apart = wrapped(found - expected, Ambiguity.of(w, 2))
+        offset = wrapped(found - expected, Ambiguity.of(w, 2))
         power = float(np.sum(np.abs(measured.modes[0]) ** 2))
-        if (np.abs(apart) < NEAR_CELLS * cells).all() and power > most:
+        if (np.abs(offset) < NEAR_CELLS * cells).all() and power > most:
             best, most = i, power
     return best
 
@@ -118,11 +118,11 @@ def _nearest(
 def seen_after(state: Gaussian, own: Pose, change: Change, passes: int) -> Gaussian:
     """A UAV as it is seen once the hardware is known better, by paths that pass the way to it so
     often."""
-    body = own.to_body(state.mean[:3] - own.position)
-    distance = np.linalg.norm(body)
-    if body[1] <= 0:  # out of view
+    direction_to = own.to_body(state.mean[:3] - own.position)
+    distance = np.linalg.norm(direction_to)
+    if direction_to[1] <= 0:  # out of view
         return state
-    u = body[[0, 2]] / distance - change.direction
+    u = direction_to[[0, 2]] / distance - change.direction
     towards = own.to_world(unit_vector(u * min(1.0, 1 / np.linalg.norm(u))))
     mean, metres = state.mean.copy(), SPEED_OF_LIGHT / passes
     mean[:3] = own.position + towards * (distance - change.delay * metres)

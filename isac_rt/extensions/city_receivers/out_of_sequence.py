@@ -229,7 +229,7 @@ class OutOfSequence(OtherPaths):
             GATE_CELLS * self._cells, GATE_STDS * np.sqrt(np.diag(path.covariance)[:2])
         )
         # zero on an axis that is not seen
-        aside = folded(np.nan_to_num(d.direction - path.direction), self._leeway.turns)
+        aside = folded(np.nan_to_num(d.direction - path.direction), self._leeway.cosine_period)
         near = (off < gate).all(axis=1) & (np.abs(aside) < self._beam).all(axis=1)
         if not near.any():
             return False

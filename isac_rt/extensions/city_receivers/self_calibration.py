@@ -165,7 +165,7 @@ class SelfCalibration(HardwareModel):
             np.zeros(2),
             np.diag(np.square(CLOCK_STD[2 - passes])),
         )
-        self._taken_out = (*self._known()[:-1], np.zeros(2))
+        self._corrected = (*self._known()[:-1], np.zeros(2))
 
     def _known(self) -> tuple[np.ndarray, ...]:
         return self.state.gains.value, self.state.slopes.value, self.state.common, self.state.clock
@@ -187,7 +187,7 @@ class SelfCalibration(HardwareModel):
         walk = np.diag(np.square(CLOCK_DRIFT)) * (elapsed * (self.state.clock_covariance[1, 1] > 0))
         self.state.clock_covariance = F @ self.state.clock_covariance @ F.T + walk
         clock = self.state.clock if self._passes == 2 else np.zeros(2)
-        self._taken_out = (*self._known()[:-1], clock)
+        self._corrected = (*self._known()[:-1], clock)
         table = self._table(cube.waveform)
         out = np.empty_like(cube.samples)
         for m, senders in enumerate(cube.schedule):
@@ -204,7 +204,7 @@ class SelfCalibration(HardwareModel):
             v[0] + 1j * v[1]
             for v in (self.state.gains.value, self.state.slopes.value, self.state.common)
         )
-        tone = 2 * np.pi * w.slope * self._taken_out[-1][0] * w.sample_interval * n
+        tone = 2 * np.pi * w.slope * self._corrected[-1][0] * w.sample_interval * n
         shared = common @ modes + 1j * tone
         own = self._elements if self._passes == 2 else self._elements[: self._antennas.num_rx]
         each = (own @ gain)[:, None] + np.multiply.outer(own @ slope, modes[1])
@@ -236,7 +236,7 @@ class SelfCalibration(HardwareModel):
         """Take in a measured path at corrected samples."""
         towards, across = self._steering(known_direction)
         gains, slopes, common, clock = (
-            now - then for now, then in zip(self._known(), self._taken_out, strict=True)
+            now - then for now, then in zip(self._known(), self._corrected, strict=True)
         )
         left_out = self._elements @ (gains[0] + 1j * gains[1])
         modes = measured.modes.reshape(MODES, -1) * np.exp(-left_out) * towards.conj()
@@ -334,7 +334,7 @@ class SelfCalibration(HardwareModel):
     def _learn_of_neighbours(self, seen: Neighbours) -> None:
         """Phases between channels, of which the frame's samples still hold what it has learnt."""
         X = self._elements[seen.second] - self._elements[seen.first]
-        left = seen.phase - X @ (self.state.gains.value[1] - self._taken_out[0][1])
+        left = seen.phase - X @ (self.state.gains.value[1] - self._corrected[0][1])
         left = np.angle(np.exp(1j * left))
         weight = 1 / (np.maximum(seen.std, LEAST_PHASE) ** 2 + MESH_PHASE**2)
         own = self.state.gains.information

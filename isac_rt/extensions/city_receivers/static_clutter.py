@@ -59,18 +59,18 @@ class StaticClutter(TrackRule):
 
     Parameters
     ----------
-    turns : of `Antennas`: an echo from beyond the view is seen so far beside its direction
+    cosine_period : of `Antennas`: an echo from beyond the view is seen so far beside its direction
     walls : the mesh; None: nothing is known of it
     velocity_period : span of unambiguous velocities [m/s]
     """
 
     def __init__(
-        self, turns: np.ndarray | float, walls: Walls | None, velocity_period: float
+        self, cosine_period: np.ndarray | float, walls: Walls | None, velocity_period: float
     ) -> None:
         self._walls, self._period = walls, velocity_period
         self._crowd = np.zeros(0, bool)
         self.state = Seen()
-        by = [(0.0, -t, t) if np.isfinite(t) else (0.0,) for t in np.broadcast_to(turns, 2)]
+        by = [(0.0, -t, t) if np.isfinite(t) else (0.0,) for t in np.broadcast_to(cosine_period, 2)]
         self._aliases = np.array([(x, z) for x in by[0] for z in by[1]])
 
     @classmethod
@@ -79,7 +79,7 @@ class StaticClutter(TrackRule):
     ) -> StaticClutter:
         """For the array of an active terminal (passes = 2) or a passive one."""
         period = Ambiguity.of(waveform, passes).period
-        return cls(antennas.turns(waveform.wavelength, passes), walls, period)
+        return cls(antennas.cosine_period(waveform.wavelength, passes), walls, period)
 
     def candidates(self, detections: Detections, own: Own) -> Detections:
         self._crowd = np.zeros(len(detections), bool)
@@ -138,8 +138,8 @@ class StaticClutter(TrackRule):
         """Follow the spots to a frame's echoes (n, 3): each echo carries on the nearest one."""
         state = self.state
         old = state.spots[state.spots[:, 4] > time - MEMORY_S]
-        apart = np.linalg.norm(places[:, None] - old[None, :, :3], axis=-1)
-        pairs = assign(np.where(apart < BESIDE_M[0], apart, np.inf))
+        separation = np.linalg.norm(places[:, None] - old[None, :, :3], axis=-1)
+        pairs = assign(np.where(separation < BESIDE_M[0], separation, np.inf))
         echo, spot = np.array(pairs, int).reshape(-1, 2).T
         old[spot, :5] = np.column_stack([places, snr, np.full(len(snr), time)])[echo]
         old[spot, 5] += 1
@@ -153,8 +153,8 @@ class StaticClutter(TrackRule):
         the foot of a wall shines too."""
         spots = self.state.spots
         fleeting = spots[:, 5] <= FOUND_AGAIN * (self.state.frames - spots[:, 6])
-        apart = np.linalg.norm(places[:, None] - spots[None, :, :3], axis=-1)
-        beside = (apart > BESIDE_M[0]) & (apart < BESIDE_M[1])
+        separation = np.linalg.norm(places[:, None] - spots[None, :, :3], axis=-1)
+        beside = (separation > BESIDE_M[0]) & (separation < BESIDE_M[1])
         beside &= spots[:, 3] < STANDS_OUT * snr[:, None]
         like = beside & (STANDS_OUT * spots[:, 3] > snr[:, None])
 

@@ -95,7 +95,7 @@ class Walls:
 
     def images(
         self,
-        body: np.ndarray,
+        target: np.ndarray,
         end: np.ndarray,
         reach: float,
         edge: float,
@@ -112,16 +112,16 @@ class Walls:
         _, normals, offsets = self.mirrors
         tried = np.arange(len(normals)) if among is None else among
         n = normals[tried]
-        behind, before = n @ body[:3] - offsets[tried], n @ end[:3] - offsets[tried]
-        apart2 = ((body[:3] - end[:3]) ** 2).sum() + 4 * behind * before  # to the image, squared
+        behind, before = n @ target[:3] - offsets[tried], n @ end[:3] - offsets[tried]
+        length2 = ((target[:3] - end[:3]) ** 2).sum() + 4 * behind * before  # to the image
         # else the wall stands between the two, or the image is too far
-        some = (behind * before > 0) & (apart2 < reach**2)
+        some = (behind * before > 0) & (length2 < reach**2)
         tried, n, behind, before = tried[some], n[some], behind[some], before[some]
-        places = mirror_image(body[:3], n, offsets[tried])
+        places = mirror_image(target[:3], n, offsets[tried])
         met = end[:3] + (places - end[:3]) * (before / (before + behind))[:, None]
         boxed = self.bounded(tried, met, edge)
         shown = np.flatnonzero(boxed)[self.holds(tried[boxed], met[boxed], edge)]
-        return tried[shown], np.hstack([places, mirror_image(body[3:6], n)])[shown]
+        return tried[shown], np.hstack([places, mirror_image(target[3:6], n)])[shown]
 
     def holds(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
         """Return whether points (n, 3) in the planes of mirrors (n,) lie on one of their faces, or
@@ -144,9 +144,9 @@ class Walls:
         return faces[(share > 0) & (share < 1)]
 
 
-def lengths(bodies: np.ndarray, end: np.ndarray) -> np.ndarray:
+def lengths(targets: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return length and its rate (K, 2) of straight paths from moving UAVs (K, 6) to `end`
     (6,)."""
-    span, moved = end[:3] - bodies[:, :3], end[3:6] - bodies[:, 3:6]
+    span, moved = end[:3] - targets[:, :3], end[3:6] - targets[:, 3:6]
     far = np.linalg.norm(span, axis=1)
     return np.column_stack([far, (span * moved).sum(axis=1) / far])

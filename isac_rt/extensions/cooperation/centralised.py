@@ -149,10 +149,10 @@ class JointState:
     uavs: tuple[TrackedUav, ...] = ()
     clocks: Mapping[str, float] = field(default_factory=dict)
 
-    def without(self, gone: set[int]) -> JointState:
+    def without(self, removed: set[int]) -> JointState:
         """The same without some UAVs."""
         first = len(self.mean) - UAV_STATES * len(self.uavs)
-        keep = [k for k in range(len(self.uavs)) if k not in gone]
+        keep = [k for k in range(len(self.uavs)) if k not in removed]
         rows = [np.arange(first), *(first + UAV_STATES * k + np.arange(UAV_STATES) for k in keep)]
         at = np.concatenate(rows)
         uavs = tuple(self.uavs[k] for k in keep)
@@ -312,12 +312,12 @@ class CentralisedTracker(Stateful):
 
     def _alive(self, joint: JointState) -> JointState:
         """Without the UAVs whose time is over."""
-        management, gone = self._lives, set[int]()
+        management, removed = self._lives, set[int]()
         for k, uav in enumerate(joint.uavs):
             longest = management.drop if uav.confirmed else management.window
             if joint.time - uav.hits[-1] > longest - ROUNDING:
-                gone.add(k)
-        return joint.without(gone) if gone else joint
+                removed.add(k)
+        return joint.without(removed) if removed else joint
 
     def _step(self, joint: JointState, scan: Scan, transmitter: np.ndarray | None) -> JointState:
         """One scan: prediction, association, update, initiation, merging of tracks of one UAV."""
@@ -466,19 +466,19 @@ class CentralisedTracker(Stateful):
 
     def _merged(self, joint: JointState) -> JointState:
         """Two UAVs in one place that no receiver saw in one frame are one: the surer stays."""
-        first, gone = self._first(joint, 0), set[int]()
+        first, removed = self._first(joint, 0), set[int]()
         uavs = list(joint.uavs)
         for i in range(len(uavs)):
             for j in range(i):
-                if {i, j} & gone or _apart(uavs[i], uavs[j]):
+                if {i, j} & removed or _distinct(uavs[i], uavs[j]):
                     continue
                 if not uavs[i].confirmed or not uavs[j].confirmed:
                     continue
                 a, b = (first + UAV_STATES * k + np.arange(SIZE) for k in (i, j))
                 C = joint.covariance
                 S = C[np.ix_(a, a)] + C[np.ix_(b, b)] - C[np.ix_(a, b)] - C[np.ix_(b, a)]
-                apart = joint.mean[a] - joint.mean[b]
-                if apart @ np.linalg.solve(S + 1e-9 * np.eye(SIZE), apart) > gate(JOIN_PROBABILITY):
+                d = joint.mean[a] - joint.mean[b]
+                if d @ np.linalg.solve(S + 1e-9 * np.eye(SIZE), d) > gate(JOIN_PROBABILITY):
                     continue
                 worse = i if np.trace(C[np.ix_(a, a)]) > np.trace(C[np.ix_(b, b)]) else j
                 kept = i + j - worse
@@ -488,8 +488,8 @@ class CentralisedTracker(Stateful):
                     hits=tuple(sorted({*uavs[i].hits, *uavs[j].hits})),
                     fed={**uavs[worse].fed, **uavs[kept].fed},
                 )
-                gone.add(worse)
-        return replace(joint, uavs=tuple(uavs)).without(gone) if gone else joint
+                removed.add(worse)
+        return replace(joint, uavs=tuple(uavs)).without(removed) if removed else joint
 
 
 @dataclass(frozen=True)
@@ -510,12 +510,12 @@ class _View:
         them."""
         tx, rx = self.scan.ends
         at, own = self._at(rx), self.scan.own
-        turn = Rotation.from_rotvec(-x[at + 6 : at + 9]).as_matrix()
+        attitude_error = Rotation.from_rotvec(-x[at + 6 : at + 9]).as_matrix()
         pose = replace(
             own,
             position=own.position - x[at : at + 3],
             velocity=own.velocity - x[at + 3 : at + 6],
-            rotation=turn @ own.rotation,
+            rotation=attitude_error @ own.rotation,
         )
         if self.transmitter is None:
             return pose, None
@@ -558,22 +558,22 @@ def _error_variance() -> np.ndarray:
     return np.square(deviations)
 
 
-def _apart(a: TrackedUav, b: TrackedUav) -> bool:
+def _distinct(a: TrackedUav, b: TrackedUav) -> bool:
     """Return whether a receiver saw both in one frame."""
     return any(of[1] == b.fed[link][1] for link, of in a.fed.items() if link in b.fed)
 
 
 def _kept(joint: JointState, scan: Scan) -> JointState:
     """Without the UAVs that rest on nothing but tracks that the scan's receiver has given up."""
-    uavs, gone = list(joint.uavs), set[int]()
+    uavs, removed = list(joint.uavs), set[int]()
     for k, uav in enumerate(uavs):
         if uav.fed.get(scan.origin, (None, 0.0))[0] in (None, *scan.kept):
             continue
         fed = {origin: of for origin, of in uav.fed.items() if origin != scan.origin}
         uavs[k] = replace(uav, fed=fed)
         if not fed:
-            gone.add(k)
-    return replace(joint, uavs=tuple(uavs)).without(gone)
+            removed.add(k)
+    return replace(joint, uavs=tuple(uavs)).without(removed)
 
 
 def _named_apart(joint: JointState) -> JointState:

@@ -27,7 +27,7 @@ from isac_rt.track.parts import POSE_STD
 from isac_rt.track.tracker import TrackSet, assign
 from isac_rt.world.swarm import Pose
 
-LEAST_APART = 0.5
+MIN_SEPARATION_M = 0.5
 """UAVs keep farther from each other than this [m]: tracks part beyond twice this."""
 SIZE = 6
 """Position and velocity in world axes [m, m/s]: what terminals tell each other of a UAV."""
@@ -494,7 +494,7 @@ class FusedTracks(Stateful):
             uav.members = [
                 k
                 for k, d, gap in zip(members, d2[0], gaps, strict=True)
-                if np.isfinite(d) and gap <= 2 * LEAST_APART
+                if np.isfinite(d) and gap <= 2 * MIN_SEPARATION_M
             ]
             kept.append(uav)
             for key in uav.members:
@@ -523,18 +523,18 @@ class FusedTracks(Stateful):
         """UAVs of one terminal's tracks that lie nearer to each other than UAVs fly are one."""
         states = [intersection_of([whole[k] for k in b.members]) for b in self.uavs]
         d2, _ = distances(states, states, JOIN_PROBABILITY)
-        gone: set[int] = set()
+        merged: set[int] = set()
         for i, j in np.argwhere(np.tril(np.isfinite(d2), -1)).tolist():
-            if {i, j} & gone:
+            if {i, j} & merged:
                 continue
             uav, other = self.uavs[i], self.uavs[j]
             pairs = product(uav.members, other.members)
             gaps = [_gap(whole[a], whole[b]) for a, b in pairs if a.origin == b.origin]
-            if gaps and max(gaps) < LEAST_APART:
+            if gaps and max(gaps) < MIN_SEPARATION_M:
                 other.members += uav.members
                 other.name = min(uav.name, other.name)
-                gone.add(i)
-        self.uavs = [b for i, b in enumerate(self.uavs) if i not in gone]
+                merged.add(i)
+        self.uavs = [b for i, b in enumerate(self.uavs) if i not in merged]
 
     def _call(self, by_key: Mapping[Key, Report]) -> None:
         """Names: the earliest that any member is known by; two UAVs never have the same. The one

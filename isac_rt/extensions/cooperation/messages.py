@@ -188,7 +188,7 @@ class Notes(Stateful):
             self.reports[key] = Report(key, since, name, time, state, lever), ""
         self.kept[origin] = Kept(time, tuple(tracks))
 
-    def stand(self, time: float, state: Gaussian) -> None:
+    def locate(self, time: float, state: Gaussian) -> None:
         """Take down where it is itself."""
         self.terminals[self.name] = SelfReport(time, state)
 
@@ -301,7 +301,7 @@ class Sightings(Stateful):
         """Return what terminals reported of themselves."""
         return self.state.terminals
 
-    def stand(self, time: float, state: Gaussian) -> None:
+    def locate(self, time: float, state: Gaussian) -> None:
         """Take down where it is itself."""
         self.terminals[self.name] = SelfReport(time, state)
 

@@ -101,7 +101,7 @@ class Cooperation(Stateful):
         self._carry_late(late, traffic)
         poses = {n: self._setup.believed(n, p) for n, p in self._setup.swarm.poses(time).items()}
         for name, notes in self._notes.items():
-            notes.stand(time, of_itself(poses[name]))
+            notes.locate(time, of_itself(poses[name]))
         for link, result in received.items():
             self._see(frame, link, result)
         views = {

@@ -146,14 +146,14 @@ def _shift(w: Waveform, tones: Tones, ramp: Ramp) -> np.ndarray:
     return ramp.frequency(middle) / w.slope * w.sampling_rate
 
 
-_HEARD = 0.28
+_BAND_MIDDLE = 0.28
 """Middle of the beats that receivers look at, without data, over the sampling rate."""
 
 
 def _band(w: Waveform, tones: Tones) -> np.ndarray:
     """(M, P) middle of the beats in each chirp [cycles per sample]."""
     data = tones.symbol_delay[0] if len(tones.symbol_delay) else np.zeros((1, 1))
-    return data * w.slope / w.sampling_rate + _HEARD
+    return data * w.slope / w.sampling_rate + _BAND_MIDDLE
 
 
 def _read(w: Waveform, tones: Tones, ends: Ends) -> Work:

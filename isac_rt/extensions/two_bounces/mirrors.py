@@ -23,7 +23,7 @@ import numpy as np
 from isac_rt.propagation.clutter.cells import Density, cut
 from isac_rt.propagation.clutter.visibility import Flight
 from isac_rt.propagation.segments.geometry import RAY_OFFSET_M, plane_of_each_face
-from isac_rt.propagation.segments.rays import Shadows
+from isac_rt.propagation.segments.rays import LosTest
 from isac_rt.propagation.segments.reflection import slab_coefficients
 from isac_rt.world.city.materials import Material
 from isac_rt.world.city.mesh import CityMesh
@@ -66,7 +66,7 @@ class Mirror:
 
 
 def strongest(
-    city: CityMesh, shadows: Shadows, flight: Flight, wavelength: float, seed: int, most: int
+    city: CityMesh, los: LosTest, flight: Flight, wavelength: float, seed: int, most: int
 ) -> tuple[list[Mirror], float]:
     """The mirrors that send on the most of what a terminal radiates on its flight, strongest first,
     at most `most`; and the share that all others send on."""
@@ -86,7 +86,7 @@ def strongest(
     share = np.zeros(group.max() + 1)
     sent = [_reflected(m, wavelength) for m in city.materials]
     for position in positions:
-        seen = np.flatnonzero(shadows.sees(position, cells.points, city.normals[cells.face]))
+        seen = np.flatnonzero(los.sees(position, cells.points, city.normals[cells.face]))
         span = cells.points[seen] - position
         r = np.linalg.norm(span, axis=1)
         face = cells.face[seen]
@@ -127,7 +127,7 @@ def _reflected(material: Material, wavelength: float) -> np.ndarray:
 
 
 def shown(
-    shadows: Shadows,
+    los: LosTest,
     position: np.ndarray,
     mirrors: list[Mirror],
     points: np.ndarray,
@@ -144,11 +144,11 @@ def shown(
     at = np.concatenate([f[1] for f in found])
     side = [np.sign(m.normal @ position - m.offset) * m.normal for m in mirrors]
     wall = np.repeat(side, [f[0].size for f in found], axis=0)
-    free = shadows.sees(position, at, wall)
+    free = los.sees(position, at, wall)
     left = np.flatnonzero(free)
     here, there, own = points[which[left]], at[left], normals[which[left]]
     own = np.sign(((there - here) * own).sum(1))[:, None] * own
-    free[left] = shadows.clear(here + RAY_OFFSET_M * own, there + RAY_OFFSET_M * wall[left])
+    free[left] = los.clear(here + RAY_OFFSET_M * own, there + RAY_OFFSET_M * wall[left])
     ends = np.cumsum([f[0].size for f in found])
     return [f[0][part] for f, part in zip(found, np.split(free, ends[:-1]), strict=True)]
 

@@ -47,7 +47,7 @@ CACHED_SAMPLES = 16
 """Time samples per terminal whose tests are remembered; a frame needs six."""
 
 
-_Sight = tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]
+_Visibility = tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]
 """How far (N,) scatterers are in sight of an end, and of each of its mirrors which show in it and
 how far."""
 
@@ -93,8 +93,8 @@ class TwoBounces:
     ) -> TwoBounces:
         """Choose each terminal's mirrors, at most `most`, for the whole of its flight."""
         mirrors = {
-            name: strongest(city, field.sight.shadows, flight, wavelength, seed, most)
-            for name, flight in field.sight.flights.items()
+            name: strongest(city, field.visibility.los, flight, wavelength, seed, most)
+            for name, flight in field.visibility.flights.items()
         }
         return cls(field, city, mirrors, wavelength)
 
@@ -112,10 +112,10 @@ class TwoBounces:
     def seen(self, state: LinkState, discs: UavDiscs | None = None) -> list[SeenByMirror]:
         """Return the scatterers in sight of both ends, once for each mirror and order; poses in
         local coordinates."""
-        sight, time = self._field.sight, state.epoch
+        direct, time = self._field.visibility, state.epoch
         ends = zip(state.link, (state.start, state.end), strict=True)
         tx, rx = (
-            (sight.share(name, pose, time), self._share(name, pose, time)) for name, pose in ends
+            (direct.share(name, pose, time), self._share(name, pose, time)) for name, pose in ends
         )
         out = self._between(state, tx, rx)
         if discs is not None:
@@ -129,12 +129,12 @@ class TwoBounces:
         tx, rx = (
             (straight.astype(np.float32), [(i, np.ones(i.size)) for i in self._test(name, at)])
             for straight, name, at in zip(
-                self._field.sight.from_places(positions), state.link, positions, strict=True
+                self._field.visibility.from_places(positions), state.link, positions, strict=True
             )
         )
         return self._between(state, tx, rx)
 
-    def _between(self, state: LinkState, tx: _Sight, rx: _Sight) -> list[SeenByMirror]:
+    def _between(self, state: LinkState, tx: _Visibility, rx: _Visibility) -> list[SeenByMirror]:
         """Ways by the mirrors of the one end, then by those of the other."""
         out = []
         for before, name, shown_in, straight in (
@@ -145,7 +145,7 @@ class TwoBounces:
                 share = share * straight[index]
                 lit = share > 0
                 if lit.any():
-                    out.append(self._by_way_of(mirror, index[lit], share[lit], state, before))
+                    out.append(self._over_mirror(mirror, index[lit], share[lit], state, before))
         return out
 
     def paths(
@@ -178,7 +178,7 @@ class TwoBounces:
 
     def _share(self, name: str, pose: Pose, time: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """For each mirror of a terminal: scatterers that show in it, and how far, from 0 to 1."""
-        flight, mirrors = self._field.sight.flights[name], self.mirrors[name]
+        flight, mirrors = self._field.visibility.flights[name], self.mirrors[name]
         if not flight.holds(pose, time):
             return [
                 (index, np.ones(index.size, np.float32))
@@ -203,7 +203,7 @@ class TwoBounces:
             for key in mine[: len(mine) - CACHED_SAMPLES + 1]:
                 del self._shown[key]
             self._shown[name, time_sample] = self._test(
-                name, self._field.sight.flights[name].time_samples[time_sample]
+                name, self._field.visibility.flights[name].time_samples[time_sample]
             )
         return self._shown[name, time_sample]
 
@@ -212,14 +212,14 @@ class TwoBounces:
         if not mirrors:
             return []
         return shown(
-            self._field.sight.shadows,
+            self._field.visibility.los,
             position,
             mirrors,
             cells.points,
             self._city.normals[cells.face],
         )
 
-    def _by_way_of(
+    def _over_mirror(
         self, mirror: Mirror, index: np.ndarray, share: np.ndarray, state: LinkState, before: bool
     ) -> SeenByMirror:
         start, end = state.start.motion(), state.end.motion()
@@ -227,7 +227,7 @@ class TwoBounces:
             start = mirror.image(state.start)
         else:
             end = mirror.image(state.end)
-        there, back = (motion_to(self._field.cells.points[index], body) for body in (start, end))
+        there, back = (motion_to(self._field.cells.points[index], pose) for pose in (start, end))
         length, rate, accel = (one + other for one, other in zip(there[:3], back[:3], strict=True))
         # the terminal at the mirror's side sends to, or receives from, where its image does
         departure, arrival = there[3], back[3]

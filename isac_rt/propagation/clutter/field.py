@@ -58,7 +58,7 @@ from isac_rt.propagation.clutter.visibility import SAMPLE_SPACING, Flight, Visib
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
 from isac_rt.propagation.segments.discs import UavDiscs
-from isac_rt.propagation.segments.rays import Shadows
+from isac_rt.propagation.segments.rays import LosTest
 from isac_rt.propagation.segments.reflection import slab_coefficients
 from isac_rt.storage import kept
 from isac_rt.world.city.materials import Material
@@ -210,7 +210,7 @@ class Scatterers(NamedTuple):
     """Scatterers of a link, and their visibility."""
 
     cells: Cells
-    sight: Visibility
+    visibility: Visibility
 
 
 class ClutterField:
@@ -223,13 +223,13 @@ class ClutterField:
         self,
         city: CityMesh,
         cells: Cells,
-        sight: Visibility,
+        visibility: Visibility,
         wavelength: float,
         num_candidates: int,
         overlap: float,
         merged: Mapping[Link, Scatterers] | None = None,
     ) -> None:
-        self._city, self.sight = city, sight
+        self._city, self.visibility = city, visibility
         self.cells = cells
         self.merged = merged or {}
         self.num_candidates = num_candidates
@@ -261,7 +261,7 @@ class ClutterField:
         scatters = np.array([m.scattering_coefficient > 0 for m in city.materials], bool)[
             city.face_material
         ]
-        shadows = Shadows(scene)
+        los = LosTest(scene)
         senders = [flights[name] for name in swarm.transmitters]
         lookouts, behind = _test_positions(senders), floor is None or floor.look_back
         fronts = [] if behind else [flight.fronts for flight in senders]
@@ -273,7 +273,7 @@ class ClutterField:
                 nonlocal of
                 of = len(face)
                 out = ever_ahead(np.concatenate(fronts), points) if fronts else np.full(of, True)
-                out[out] = shadows.ever_sees(lookouts, points[out], city.normals[face[out]])
+                out[out] = los.ever_sees(lookouts, points[out], city.normals[face[out]])
                 return out
 
             cells = cut(city, scatters, positions, density, seed, in_sight)
@@ -284,8 +284,8 @@ class ClutterField:
         depends_on = [plain(city), positions, lookouts, fronts, asdict(density), seed, MOST_CELLS]
         had = kept("cells", [*depends_on, mi.variant()], found)
         cells = Cells(**had["cells"])
-        sight = Visibility(shadows, flights, facets_of(cells, city), wavelength, city)
-        field = cls(city, cells, sight, wavelength, had["of"], had["overlap"])
+        visibility = Visibility(los, flights, facets_of(cells, city), wavelength, city)
+        field = cls(city, cells, visibility, wavelength, had["of"], had["overlap"])
         if floor is None:
             return field
         poses = {
@@ -305,22 +305,22 @@ class ClutterField:
 
     def of(self, link: Link) -> Scatterers:
         """Return the scatterers of a link."""
-        return self.merged.get(link, Scatterers(self.cells, self.sight))
+        return self.merged.get(link, Scatterers(self.cells, self.visibility))
 
     def whole(self) -> ClutterField:
         """Return the field without merging."""
         return self._with({})
 
     def _with(self, merged: Mapping[Link, Scatterers]) -> ClutterField:
-        whole = self._city, self.cells, self.sight, self._wavelength
+        whole = self._city, self.cells, self.visibility, self._wavelength
         return ClutterField(*whole, self.num_candidates, self.overlap, merged)
 
     def _own(self, link: Link, cells: Cells) -> Scatterers:
         """Build the scatterers of one link from its cells."""
-        flights = {name: self.sight.flights[name] for name in link}
+        flights = {name: self.visibility.flights[name] for name in link}
         facets = facets_of(cells, self._city)
-        sight = Visibility(self.sight.shadows, flights, facets, self._wavelength, self._city)
-        return Scatterers(cells, sight)
+        visibility = Visibility(self.visibility.los, flights, facets, self._wavelength, self._city)
+        return Scatterers(cells, visibility)
 
     def _below_noise(
         self,
@@ -331,22 +331,22 @@ class ClutterField:
     ) -> dict[str, dict[str, np.ndarray]]:
         """Return the cells of each link, merged below its noise (`merging`); `poses` are local, at
         the instants of `floor`."""
-        cells, sight = self.cells, self.sight
+        cells, visibility, flights = self.cells, self.visibility, self.visibility.flights
         finest = density.finest(cKDTree(positions).query(cells.points)[0])
         error = error_for(density.per_metre)
         seen = {
-            name: sight.from_places(np.array([pose.position for pose in of]))
+            name: visibility.from_places(np.array([pose.position for pose in of]))
             for name, of in poses.items()
         }
         ever = {
-            name: sight.ever(_test_positions([sight.flights[name]]), known=np.any(at, axis=0))
+            name: visibility.ever(_test_positions([flights[name]]), known=np.any(at, axis=0))
             for name, at in seen.items()
         }
         merged = {}
         for link, over_noise in floor.over_noise.items():
             held = ever[link.tx] & ever[link.rx]
             if not floor.look_back:
-                held &= ever_ahead(sight.flights[link.rx].fronts, cells.points)
+                held &= ever_ahead(flights[link.rx].fronts, cells.points)
             both = np.flatnonzero(held)
             some, visible = cells.select(both), []
             for k in np.flatnonzero(over_noise):
@@ -375,28 +375,28 @@ class ClutterField:
     @property
     def nbytes(self) -> int:
         """Memory of the scatterers and of the stored visibility [bytes]."""
-        every = [(self.cells, self.sight), *self.merged.values()]
+        every = [(self.cells, self.visibility), *self.merged.values()]
         return sum(a.nbytes for cells, _ in every for a in vars(cells).values()) + sum(
-            sight.nbytes for _, sight in every
+            visibility.nbytes for _, visibility in every
         )
 
     def seen(self, state: LinkState, discs: UavDiscs | None = None) -> Seen:
         """Return the scatterers visible from both ends of a link, poses in local coordinates, with
         the shadows of `discs`."""
         (tx, rx), own, start, end = state.link, state.link.own, state.start, state.end
-        cells, sight = self.of(state.link)
-        share = sight.share(tx, start, state.epoch)
+        cells, visibility = self.of(state.link)
+        share = visibility.share(tx, start, state.epoch)
         if not own:
-            share = share * sight.share(rx, end, state.epoch)
+            share = share * visibility.share(rx, end, state.epoch)
         found = self._paths_over(cells, share, state)
         if discs is not None:
             points = cells.points.take(found.index, axis=0)
             sent, visible = (discs.spared([(name,)]) for name in (tx, rx))
-            there = discs.sight(start.position, points, found.tx_radius, self._wavelength, sent)
+            there = discs.gain(start.position, points, found.tx_radius, self._wavelength, sent)
             back = (
                 there
                 if own
-                else discs.sight(end.position, points, found.rx_radius, self._wavelength, visible)
+                else discs.gain(end.position, points, found.rx_radius, self._wavelength, visible)
             )
             found.magnitude[:] *= there * back
         lit = np.flatnonzero(found.magnitude)
@@ -409,7 +409,7 @@ class ClutterField:
         """Return the scatterers visible from both ends by rays alone, on or off the planned
         flights; poses in local coordinates."""
         ends = np.array([state.start.position, state.end.position])
-        one, other = self.sight.from_places(ends)
+        one, other = self.visibility.from_places(ends)
         return self._paths_over(self.cells, (one & other).astype(np.float32), state)
 
     def _paths_over(self, cells: Cells, share: np.ndarray, state: LinkState) -> Seen:

@@ -31,14 +31,14 @@ def lies_twice(cells: Cells, city: CityMesh) -> np.ndarray:
     order = np.lexsort((cells.points[:, 0], row))
     points, begin = cells.points[order], np.searchsorted(row[order], np.arange(len(faces) + 1))
     covered = np.zeros(len(cells), bool)
-    for hidden, cover in _hidden_first(corners, city.areas[faces], normals):
+    for lower, upper in _lower_first(corners, city.areas[faces], normals):
         low, high = (
-            corners[cover, :, 0].min() - RAY_OFFSET_M,
-            corners[cover, :, 0].max() + RAY_OFFSET_M,
+            corners[upper, :, 0].min() - RAY_OFFSET_M,
+            corners[upper, :, 0].max() + RAY_OFFSET_M,
         )
-        of = slice(begin[hidden], begin[hidden + 1])
+        of = slice(begin[lower], begin[lower + 1])
         some = of.start + np.arange(*np.searchsorted(points[of, 0], [low, high]))
-        covered[order[some]] |= _inside(points[some], corners[cover], normals[cover])
+        covered[order[some]] |= _inside(points[some], corners[upper], normals[upper])
     return covered
 
 
@@ -48,10 +48,10 @@ def _inside(points: np.ndarray, corners: np.ndarray, normal: np.ndarray) -> np.n
     return near & over_triangle(points, corners, normal)
 
 
-def _hidden_first(
+def _lower_first(
     corners: np.ndarray, areas: np.ndarray, normals: np.ndarray
 ) -> Iterator[tuple[int, int]]:
-    """Yield pairs of faces (F, 3, 3) that overlap in one plane: the one left out, the one kept.
+    """Yield pairs of faces (F, 3, 3) that overlap in one plane: the lower left out, the upper kept.
     Rounded areas and coordinates decide, not the order of the faces."""
     in_order = np.lexsort((*np.sort(corners, axis=1).reshape(-1, 9).T, areas.round(6)))
     rank = np.argsort(in_order)

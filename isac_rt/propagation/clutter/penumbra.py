@@ -148,9 +148,9 @@ def _widths(
     along = np.roll(corners, -1, axis=1) - corners
     size = np.maximum(np.linalg.norm(along, axis=2, keepdims=True), 1e-9)
     along = along / size
-    way = at[:, None] - corners
-    share = np.clip((way * along).sum(2, keepdims=True), 0, size)
-    edge = along[np.arange(len(at)), np.linalg.norm(way - share * along, axis=2).argmin(axis=1)]
+    offset = at[:, None] - corners
+    share = np.clip((offset * along).sum(2, keepdims=True), 0, size)
+    edge = along[np.arange(len(at)), np.linalg.norm(offset - share * along, axis=2).argmin(axis=1)]
     across = np.cross(edge, ray)
     size = np.linalg.norm(across, axis=1)
     across /= np.maximum(size, 1e-9)[:, None]

@@ -19,7 +19,7 @@ from scipy.interpolate import BSpline
 
 from isac_rt.propagation.clutter.penumbra import REACH as PENUMBRA
 from isac_rt.propagation.clutter.penumbra import Crossings, Facets, crossings, penumbra
-from isac_rt.propagation.segments.rays import Shadows
+from isac_rt.propagation.segments.rays import LosTest
 from isac_rt.storage import checksum, kept, pack
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Trajectory
@@ -142,7 +142,7 @@ class Visibility:
 
     Parameters
     ----------
-    shadows : for rays
+    los : for rays
     flights : by terminal
     facets : the N points
     wavelength : [m]
@@ -151,13 +151,13 @@ class Visibility:
 
     def __init__(
         self,
-        shadows: Shadows,
+        los: LosTest,
         flights: dict[str, Flight],
         facets: Facets,
         wavelength: float,
         city: CityMesh,
     ) -> None:
-        self.shadows, self.flights = shadows, flights
+        self.los, self.flights = los, flights
         self._facets, self._wavelength = facets, wavelength
         self._depends_on = [city.vertices, city.faces, [*facets], wavelength, mi.variant()]
         self._content = ""
@@ -203,14 +203,14 @@ class Visibility:
 
     def from_places(self, positions: np.ndarray) -> np.ndarray:
         """Return the visibility (K, N) bool from positions (K, 3), by rays alone."""
-        return self.shadows.all_seen(positions, self._facets.points, self._facets.normals)
+        return self.los.all_seen(positions, self._facets.points, self._facets.normals)
 
     def ever(self, positions: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Return the visibility (N,) bool from any of positions (K, 3), by rays alone; `known` to
         be visible already."""
         out, left = known.copy(), np.flatnonzero(~known)
         points, normals = self._facets.points[left], self._facets.normals[left]
-        out[left] = self.shadows.ever_sees(positions, points, normals)
+        out[left] = self.los.ever_sees(positions, points, normals)
         return out
 
     def _near(self, name: str, time_sample: int) -> _Nearby:
@@ -268,7 +268,7 @@ class Visibility:
 
     def _crossings(self, time_samples: np.ndarray, seen: np.ndarray) -> Crossings:
         """Return the crossings between two time samples (2, 3) with visibility `seen` (2, N)."""
-        return crossings(self.shadows.triangles, time_samples, seen, self._facets, self._wavelength)
+        return crossings(self.los.triangles, time_samples, seen, self._facets, self._wavelength)
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ SAMPLES_PER_BATCH = AROUND + 1
 frame needs."""
 FAR = 1e6
 """Reach of the rays [m]."""
-_TURN, _SHIFT = 0.5698402909980532, 0.7548776662466927
+_AZIMUTH_STEP, _HEIGHT_STEP = 0.5698402909980532, 0.7548776662466927
 """Steps of the plane's most even sequence: turn of the directions from time sample to time sample,
 and their shift along the axis."""
 
@@ -153,14 +153,14 @@ class Search:
         at, chain = np.broadcast_to(position, along.shape), np.full(len(along), -1)
         last = chain
         for _ in range(self._depth):
-            way, face = self._hit(at, along)
+            distance, face = self._hit(at, along)
             plane = np.where(face < 0, -1, self._city.plane_of_face[face])
             on = (face >= 0) & (plane != last)
-            at, along, way, face, last = at[on], along[on], way[on], face[on], plane[on]
+            at, along, distance, face, last = at[on], along[on], distance[on], face[on], plane[on]
             chain = levels.grown(chain[on], last)
             normal = self._city.normals[face]
             side = np.sign((along * normal).sum(1))[:, None]
-            at = at + way[:, None] * along - RAY_OFFSET_M * side * normal
+            at = at + distance[:, None] * along - RAY_OFFSET_M * side * normal
             along = mirror_image(along, normal)
         return levels.chains()
 
@@ -206,7 +206,7 @@ def directions(count: int, number: int) -> np.ndarray:
     """(N, 3) unit vectors spread evenly over the sphere on a Fibonacci spiral; other ones for each
     number."""
     i, golden = np.arange(count), (np.sqrt(5) - 1) / 2
-    z = 1 - 2 * (i + (0.5 + _SHIFT * number) % 1) / count
-    azimuth = 2 * np.pi * ((golden * i + _TURN * number) % 1)
+    z = 1 - 2 * (i + (0.5 + _HEIGHT_STEP * number) % 1) / count
+    azimuth = 2 * np.pi * ((golden * i + _AZIMUTH_STEP * number) % 1)
     flat = np.sqrt(1 - z**2)
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z], axis=1)

@@ -63,7 +63,7 @@ class UavDiscs:
             self._shade(out, chain[:, k], chain[:, k + 1], before[:, k], total, wavelength, spared)
         return out
 
-    def sight(
+    def gain(
         self,
         position: np.ndarray,
         points: np.ndarray,

@@ -20,7 +20,7 @@ from isac_rt.kernels import propagation_edges
 from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.propagation_edges import MOST_TRIED
 from isac_rt.propagation.segments.diffraction import LIT_REACH, SHADOW_REACH
-from isac_rt.propagation.segments.rays import Shadows
+from isac_rt.propagation.segments.rays import LosTest
 from isac_rt.world.city.mesh import CityMesh
 
 BESIDE = 0.01
@@ -106,8 +106,8 @@ class Bends:
 class ShadowEdges:
     """Finds the edges of one city that shade or brush straight paths."""
 
-    def __init__(self, city: CityMesh, shadows: Shadows, wavelength: float) -> None:
-        self._edges, self._shadows, self._wavelength = Edges.of(city), shadows, wavelength
+    def __init__(self, city: CityMesh, los: LosTest, wavelength: float) -> None:
+        self._edges, self._los, self._wavelength = Edges.of(city), los, wavelength
 
     def bends(self, starts: np.ndarray, ends: np.ndarray) -> Bends:
         """For paths (K, 3) to (K, 3), neither end nearer to a surface than `BESIDE`. Local
@@ -116,7 +116,7 @@ class ShadowEdges:
         nu, points = np.full(count, -np.inf), np.full((count, 3), np.nan)
         if not count or not len(self._edges.start):
             return Bends(nu, points)
-        lit = self._shadows.clear(starts, ends)
+        lit = self._los.clear(starts, ends)
         nu[~lit] = np.inf
         reach = np.where(lit, LIT_REACH, SHADOW_REACH) ** 2 / 4 * self._wavelength
         edges = self._edges
@@ -127,11 +127,11 @@ class ShadowEdges:
         detour, at, out = (np.concatenate(part) for part in zip(*found, strict=True))
         ahead = (ends - starts)[path]
         ahead *= BESIDE / np.linalg.norm(ahead, axis=1, keepdims=True)
-        free, covered = at + BESIDE * out, at - BESIDE * out
+        free, behind = at + BESIDE * out, at - BESIDE * out
         from_here, to_there = starts[path], ends[path]
-        tests = self._shadows.clear(
-            np.concatenate([from_here, free, from_here, covered - ahead]),
-            np.concatenate([free, to_there, covered + ahead, to_there]),
+        tests = self._los.clear(
+            np.concatenate([from_here, free, from_here, behind - ahead]),
+            np.concatenate([free, to_there, behind + ahead, to_there]),
         ).reshape(4, -1)
         true = np.flatnonzero(tests[0] & tests[1] & ~(tests[2] & tests[3]))
         which, first = np.unique(
@@ -167,8 +167,8 @@ def near(
     off_sum = off[0] + off[1]
     at = (foot[0] * off[1] + foot[1] * off[0]) / np.maximum(off_sum, 1e-9)
     point = edges.start + np.clip(at, 0, 2 * edges.half)[:, None] * unit
-    way = sum(np.linalg.norm(point - end, axis=1) for end in (source, sink))
-    detour = way - np.linalg.norm(sink - source)
+    length = sum(np.linalg.norm(point - end, axis=1) for end in (source, sink))
+    detour = length - np.linalg.norm(sink - source)
     normal = np.cross(unit, ahead)
     size = np.linalg.norm(normal, axis=1)
     # a silhouette: both faces lie on one side of the plane of the path and the edge

@@ -36,7 +36,7 @@ from isac_rt.propagation.segments.geometry import (
     plane_of_each_face,
     unfold,
 )
-from isac_rt.propagation.segments.rays import Shadows
+from isac_rt.propagation.segments.rays import LosTest
 from isac_rt.propagation.segments.reflection import mirror_amplitude
 from isac_rt.propagation.segments.segment_set import SegmentSet, segment_set
 from isac_rt.world.city.mesh import CityMesh
@@ -141,13 +141,13 @@ class Images:
     Parameters
     ----------
     city : CityMesh
-    shadows : for rays
+    los : for rays
     wavelength : [m]
     depth : most planes of a chain
     """
 
-    def __init__(self, city: CityMesh, shadows: Shadows, wavelength: float, depth: int) -> None:
-        self._city, self._shadows, self._wavelength = city, shadows, wavelength
+    def __init__(self, city: CityMesh, los: LosTest, wavelength: float, depth: int) -> None:
+        self._city, self._los, self._wavelength = city, los, wavelength
         self._depth, self._mirrors = depth, Mirrors.of(city)
         self._planes = plane_of_each_face(city)
 
@@ -212,7 +212,7 @@ class Images:
             np.concatenate([np.zeros((0, 3)), *(rays[side].reshape(-1, 3) for rays in lifted)])
             for side in (0, 1)
         )
-        clear, out, first = self._shadows.clear(starts, ends), [], 0
+        clear, out, first = self._los.clear(starts, ends), [], 0
         for rays, _ in lifted:
             here = clear[first : first + rays.shape[0] * rays.shape[1]]
             out.append(np.all(here.reshape(rays.shape[:2]), axis=1))

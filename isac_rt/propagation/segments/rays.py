@@ -62,8 +62,8 @@ class Triangles:
         return np.where(shape == 0, -1, self._first[shape] + prim)
 
 
-class Shadows:
-    """Tests of sight in a scene."""
+class LosTest:
+    """Line-of-sight tests in a scene."""
 
     def __init__(self, scene: mi.Scene) -> None:
         self.scene = scene
@@ -141,8 +141,8 @@ class Shadows:
 
 
 def _ray(position: list[mi.Float64], facet: list[mi.Float64]) -> mi.Ray3f:
-    """From a facet, its point, then its normal, to a place: line by line as `Shadows.sees` has it,
-    so that both agree to the last bit."""
+    """From a facet, its point, then its normal, to a place: line by line as `LosTest.sees`
+    has it, so that both agree to the last bit."""
     (x, y, z), (px, py, pz, nx, ny, nz) = position, facet
     side = dr.select((x - px) * nx + (y - py) * ny + (z - pz) * nz < 0, -RAY_OFFSET_M, RAY_OFFSET_M)
     sx, sy, sz = px + side * nx, py + side * ny, pz + side * nz

@@ -61,7 +61,7 @@ def without_leakage(
     weight = np.abs(amplitude) ** 2
     common = float((weight * own).sum() / weight.sum())
     delay += common / (2 * np.pi) * known.waveform.delay_step
-    return _taken_out(samples, known, delay, *_fit(known, _sums(samples, known, delay, _powers)))
+    return _subtracted(samples, known, delay, *_fit(known, _sums(samples, known, delay, _powers)))
 
 
 def _powers(x: np.ndarray) -> np.ndarray:
@@ -129,7 +129,7 @@ def _series(phi: np.ndarray) -> np.ndarray:
     return (1j * phi[..., None]) ** orders / np.array([factorial(q) for q in orders])
 
 
-def _taken_out(
+def _subtracted(
     samples: np.ndarray, known: Known, delay: float, amplitude: np.ndarray, phi: np.ndarray
 ) -> np.ndarray:
     """The samples less a coupling of every pair."""

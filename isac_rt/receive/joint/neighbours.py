@@ -68,7 +68,7 @@ def refine_jointly(moments: Moments, detections: Detections) -> tuple[Detections
     group = _clusters(known, start)
     settled = ~np.isin(group, group[~np.array(near)])
     probed = {0} if d.is_reference[order[0]] else set()
-    found, parent = _with_hidden(moments, found, settled, probed)
+    found, parent = _with_neighbours(moments, found, settled, probed)
     settled = np.append(settled, np.ones(len(parent), bool))
     return _merged(known, d, order, _widened(moments, found), parent, settled)
 
@@ -96,7 +96,7 @@ def _widened(moments: Moments, found: Fit) -> list[JointPath]:
     return [replace(p, std=p.std * s) for p, s in zip(paths, np.sqrt(level), strict=True)]
 
 
-def _with_hidden(
+def _with_neighbours(
     moments: Moments, found: Fit, settled: np.ndarray, probed: Set[int]
 ) -> tuple[Fit, list[int]]:
     """A fit with the paths that are found beside its strongest settled ones behind, and beside

@@ -177,12 +177,12 @@ def test_bodies_that_others_know_of_explain_echoes():
     nobody = np.zeros(1, bool)
     for spread, expected in ((1e-3, 2), (4.0, 0)):
         body = Gaussian(np.concatenate([BODY[:3] + ORIGIN, BODY[3:]]), np.eye(6) * spread)
-        reported = track_set([Track.of_body(body)], OWN)
+        reported = track_set([Track.of_state(body)], OWN)
         leeway = Leeway(RESOLUTION, Ambiguity(PERIOD))
         found = suspicion(tracks, OWN, Walls(wall()), leeway, reported, nobody)
         assert found.order.tolist() == [expected] and found.source.tolist() == [-1]
     beside = track(8, BODY[:3] + np.array([0.03, 0.2, 0.05]), BODY[3:])
-    sure = track_set([Track.of_body(Gaussian(body.mean, np.eye(6) * 1e-3))], OWN)
+    sure = track_set([Track.of_state(Gaussian(body.mean, np.eye(6) * 1e-3))], OWN)
     wide = Leeway(RESOLUTION * 40, Ambiguity(PERIOD))
     assert not suspicion(track_set([beside], OWN), OWN, Walls(wall()), wide, sure, nobody).suspect
 
@@ -237,7 +237,7 @@ def test_directions_turn_by_what_the_array_tells_apart_whatever_the_view(passes)
     antennas = Antennas(
         tx_x=2, tx_z=2, rx_x=4, rx_z=4, spacing=0.5 * w.wavelength, half_view=np.radians(40)
     )
-    turns = Leeway.of(w, antennas, passes).turns
+    turns = Leeway.of(w, antennas, passes).cosine_period
     places = antennas.virtual_positions if passes == 2 else antennas.rx_positions
     places = (places - places[0]) / w.wavelength
     for turn, axis in zip(turns, (0, 2), strict=True):

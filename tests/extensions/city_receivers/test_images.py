@@ -221,7 +221,7 @@ def test_images_of_the_transmitter_start_no_track_where_they_stand():
     sender = np.append(OWN.position, [1.3, -0.4, 2.2])
     own = pose([3.7, 8.9, 2.2], [1.0, 0.0, 0.0])
     z = sender_images(sender, own, city(WALL), 100.0)[0]
-    known = Track.of_body(Gaussian(sender, 1e-4 * np.eye(6)))
+    known = Track.of_state(Gaussian(sender, 1e-4 * np.eye(6)))
     d = detections(
         [z[0], z[0] + 2.1 * W.range_cell(1), z[0], z[0]],
         [z[1], z[1], z[1] + 2.1 * W.velocity_cell(1), z[1]],
@@ -244,7 +244,7 @@ def test_an_image_beyond_the_view_starts_no_track_in_its_alias():
     own = pose([3.7, 8.9, 2.2], (np.cos(off) * ahead - np.sin(off) * right).tolist())
     z = sender_images(sender, own, city(WALL), 100.0)[0]
     assert z[2] > 0.9
-    known = Track.of_body(Gaussian(sender, 1e-4 * np.eye(6)))
+    known = Track.of_state(Gaussian(sender, 1e-4 * np.eye(6)))
     d = detections([z[0], z[0]], [z[1], z[1]], [z[2] - 1 / 0.5774, z[2] - 0.5 / 0.5774])
     d = replace(d, direction=np.column_stack([d.direction[:, 0], np.full(2, z[3])]))
     found = Images(city(WALL), ANTENNAS, W, 1).candidates(d, Own(own, 0.0, reference=known))

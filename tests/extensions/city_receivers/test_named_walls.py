@@ -134,7 +134,7 @@ def test_the_city_is_expected_from_where_the_data_say(read):
     told = Pose(SENDER, VELOCITY, np.zeros(3), np.eye(3))
     off = np.array([1.0, 0.0, 0.0, 0.0, 1.2, 0.0])
     tracked = Gaussian(np.concatenate([SENDER, VELOCITY]) + off, np.eye(6) * 1e-4)
-    terminal.reference.state = Followed(Track.of_body(tracked), 0.0, read=read)
+    terminal.reference.state = Followed(Track.of_state(tracked), 0.0, read=read)
     with pytest.raises(Asked):
         terminal.step(None, OWN, 0.0, True, sender=told)
     expected = tracked.mean - off * read

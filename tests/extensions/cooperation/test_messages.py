@@ -38,7 +38,7 @@ def state(x=30.0, variance=0.01):
 def seen(notes, time, *numbers, origin="A->A", variance=0.01):
     lever = np.zeros((6, ERRORS))
     notes.see(origin, time, {n: Reported(state(30 + 5 * n, variance), lever) for n in numbers})
-    notes.stand(time, state(0.0))
+    notes.locate(time, state(0.0))
     return notes
 
 
@@ -150,7 +150,7 @@ def test_words_that_come_back_make_nothing_surer():
         seen(a, T * frame, 1, variance=0.04)
         for notes, origin in ((b, "A->B"), (c, "A->C")):
             notes.see(origin, T * frame, {})
-            notes.stand(T * frame, state(-50.0))
+            notes.locate(T * frame, state(-50.0))
         words = {
             (x.name, y.name): x.compose(y.name, 10**4) for x, y in ((a, b), (b, a), (b, c), (c, b))
         }
@@ -234,7 +234,7 @@ def sightings(name):
     folds = Ambiguity(30.0), Ambiguity(60.0)
     tracker = CentralisedTracker(("A", "B"), Tracking(), TrackManagement(3, 5 * T, 0.36), folds)
     out = Sightings(name, tracker)
-    out.stand(0.0, state(0.0))
+    out.locate(0.0, state(0.0))
     return out
 
 

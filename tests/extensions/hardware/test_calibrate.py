@@ -100,7 +100,7 @@ def test_a_board_that_is_made_up_gives_its_errors_back(board, settings):
     assert np.abs(again.rx_delay).max() < 1e-13
 
 
-def test_the_slope_of_the_response_is_found_and_taken_out(board):
+def test_the_slope_of_the_response_is_found_and_corrected(board):
     """Planted bug: `slope += 0.5 * change`, which another start would hide."""
     curvature = -0.41 + 0.07j
     capture, _ = board(curvature=curvature, noise=0.5)

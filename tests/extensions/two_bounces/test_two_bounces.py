@@ -424,7 +424,7 @@ def test_ways_by_mirrors_are_coherent_with_a_separate_sum(street):
                 strict=True,
             ):
                 shares[id(m)][index] = share
-            straight = model.field.sight.share("A", local, when)
+            straight = model.field.visibility.share("A", local, when)
             for part in model.two_bounces.seen(LinkState(Link("A", "A"), when, local, local)):
                 if part.before:
                     q, n = part.seen, city.normals[cells.face[part.seen.index]]
