@@ -15,7 +15,7 @@ import textwrap
 from collections.abc import Callable, Iterator, Set
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     Field,
@@ -53,6 +53,8 @@ NEAREST_M = 0.05
 
 class Scenario(Node):
     """Everything that a run depends on."""
+
+    REMOVED: ClassVar[dict[str, str]] = {"cooperation: detections": "cooperation: tracks"}
 
     name: Name = "unnamed"
     """Name of the scenario, which titles results and names the folder they go to by default. It may
@@ -108,10 +110,10 @@ class Scenario(Node):
     """The Kalman filters, and when a track begins and ends. By default for gentle flight."""
     belief: Belief = Belief()
     """What terminals believe wrongly of themselves and of the city. By default nothing."""
-    cooperation: Literal["none", "tracks", "detections"] = "none"
+    cooperation: Literal["none", "tracks"] = "none"
     """Exchange between terminals. `none`, the default. `tracks`: confirmed tracks and own
-    positions, with an active terminal's data or a passive one's feedback; each terminal fuses them.
-    `detections`: detections instead, in one filter with pose and clock errors as states."""
+    positions, with an active terminal's data or a passive one's feedback; each terminal fuses
+    them."""
     compare: dict[Name, ReceiverSet] = Field({})
     """Further sets of receivers by name, which receive the same samples. By default none."""
 

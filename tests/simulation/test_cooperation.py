@@ -2,33 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from talking import scenario
 from test_resume import Stopped, assert_equal_results, stopping_at
 
-from isac_rt.extensions.cooperation.swarm import scan_of
+from isac_rt.extensions.cooperation.swarm import Cooperation
 from isac_rt.frame.access import Access
-from isac_rt.frame.link import Link
-from isac_rt.frame.waveform import Waveform
+from isac_rt.frame.settings import Array, Noise
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import Detections, Reception
 from isac_rt.results.dataset import fused_positions
 from isac_rt.results.provenance import run_content
-from isac_rt.results.scoring import LinkResult
 from isac_rt.results.swarm import SWARM
+from isac_rt.scenario.file import load
 from isac_rt.scenario.presets import ReceiverSet
 from isac_rt.simulation import simulate
 from isac_rt.simulation.resume import Resume
+from isac_rt.simulation.setup import prepare
 from isac_rt.simulation.stations import standard_terminal
-from isac_rt.track.filter import Gaussian, measure
+from isac_rt.track.filter import Gaussian
+from isac_rt.track.fused import Fused, Key, Name
 from isac_rt.track.settings import Tracking
-from isac_rt.track.tracker import Track, track_set
 from isac_rt.views.animate import animate
 from isac_rt.views.scene import moving_scene
 from isac_rt.views.tables import swarm_table
 from isac_rt.world.city.mesh import CityMesh
-from isac_rt.world.swarm import Pose
+
+SCENES = Path(__file__).parents[2] / "scenes"
 
 
 @pytest.fixture(scope="module")
@@ -36,41 +39,15 @@ def talked():
     return simulate.run(scenario(), snapshots=2)
 
 
-@pytest.fixture(scope="module")
-def pooled():
-    return simulate.run(scenario(cooperation="detections"), snapshots=2)
-
-
-def test_nothing_else_of_a_run_depends_on_what_is_told(talked, pooled):
+def test_nothing_else_of_a_run_depends_on_what_is_told(talked):
     """The same bits. Planted bug: a picture's track that updates a terminal's tracker."""
     alone = simulate.run(scenario(cooperation="none"), snapshots=2)
-    for talking in (talked, pooled):
-        for name, variable in alone.dataset.variables.items():
-            kind = variable.dtype.kind == "f"
-            assert np.array_equal(talking.dataset[name].values, variable.values, equal_nan=kind), (
-                name
-            )
-        for key in ("terminals", "links", "paths"):
-            assert talking.summary[key] == alone.summary[key]
+    for name, variable in alone.dataset.variables.items():
+        kind = variable.dtype.kind == "f"
+        assert np.array_equal(talked.dataset[name].values, variable.values, equal_nan=kind), name
+    for key in ("terminals", "links", "paths"):
+        assert talked.summary[key] == alone.summary[key]
     assert alone.summary["swarm"] is None
-
-
-def test_detections_are_heard_as_the_links_carry_them(pooled):
-    """The AT sends what its tentative tracks took from the first data frame on: those of frame 1
-    leave with frame 2. A data frame has 886 bits: 64 + 136 for itself, 208, and for each of its two
-    tracks 16 and 165; the newest frame's fit and no other's. The feedback has 1000. Planted
-    bugs: what a pilot carries; bits of lost messages left out."""
-    d, p = pooled.dataset, pooled.summary["swarm"]["terminals"]
-    k = list(d.owner.values).index("PT")
-    assert d.fused_capacity.values[:, k].tolist() == [0, 0] + [886] * 7
-    assert d.fused_reports.values[:3, k].tolist()[:2] == [0, 0]
-    assert (d.fused_reports.values[3:, k] > 0).all()
-    assert (d.fused_bits.values[:, k] <= 886).all()
-    assert p["PT"]["bits"] == d.fused_bits.values[:, k].sum()
-    assert p["PT"]["bits_capacity"] == 886 * 7
-    whole = d.fused_bits.values[3:, k] == 64 + 136 + 208 + 2 * (16 + 165)
-    assert whole.sum() >= 4
-    assert p["PT"]["left_out"] == d.fused_left_out.values[:, k].sum()
 
 
 def one_body_in_all_pictures(d):
@@ -86,16 +63,6 @@ def one_body_in_all_pictures(d):
         assert (mine & (d.fused_terminal.values < 0)).sum() == 1
     assert len(names) == 1
     return last
-
-
-def test_the_target_is_one_body_in_all_pooled_pictures(pooled):
-    """Of both terminals' detections, under one name, and nearer to the truth than the deviations
-    stated allow for; the terminals are recognised."""
-    one_body_in_all_pictures(pooled.dataset)
-    swarm = pooled.summary["swarm"]
-    assert swarm["targets"]["U"]["switches"] == 0
-    assert swarm["rmse"]["position_m"] < 0.1 and swarm["nees"] < 1.5
-    assert swarm["false_tracks_per_frame"] == 0
 
 
 def test_who_hears_what_and_when(talked):
@@ -149,12 +116,11 @@ def test_a_terminal_that_does_not_decode_hears_nothing():
     assert not [b for by_frame in known.values() for uavs in by_frame for b in uavs if b.terminal]
 
 
-@pytest.mark.parametrize("cooperation", ["tracks", "detections"])
-def test_a_stopped_run_goes_on_to_the_same_pictures(cooperation, tmp_path):
+def test_a_stopped_run_goes_on_to_the_same_pictures(tmp_path):
     """Also of a set that is compared. Planted bugs: the channels, the names or what fed the tracks
     not taken up."""
     other = {"other": ReceiverSet(receivers=Receivers(), tracking=Tracking(confirm_hits=2))}
-    flight = scenario(frames=7, compare=other, cooperation=cooperation)
+    flight = scenario(frames=7, compare=other)
     whole = simulate.run(flight, snapshots=2)
     for stop in (3, 5, None):
         resume = Resume(tmp_path, run_content(flight, 2), every=0.0)
@@ -193,32 +159,38 @@ def test_the_report_and_the_moving_picture_show_the_pictures(talked):
     assert marks["fused tracks"] == pytest.approx([here], abs=1.0)
 
 
-def test_a_reference_is_not_told_as_a_detection():
-    """Of two tracks that a frame has fed, one is the transmitter's, which says itself where it is.
-    Planted bug: all tracks are told."""
-    own = Pose.at_rest((0.0, 0.0, 20.0), (0, 1, 0))
-    states = [np.array([1.0, 20, 22, 0, 3, 0, 0, 0, 0]), np.array([9.0, 31, 24, 1, 2, 0, 0, 0, 0])]
-    tracks = [
-        Track(k, Gaussian(mean, np.eye(9)), 50.0, confirmed=True, detection=1 - k)
-        for k, mean in enumerate(states)
-    ]
-    z = np.array([measure(mean, own) for mean in states[::-1]])
-    found = Detections(
-        range=z[:, 0],
-        velocity=z[:, 1],
-        direction=z[:, 2:],
-        snr=np.full(2, 80.0),
-        std=np.full((2, 4), 0.01),
-        is_reference=np.zeros(2, bool),
-        starts=np.ones(2, bool),
-    )
-    waveform = Waveform(num_samples=256)
-    received = LinkResult(
-        Reception.undecoded(waveform, found), track_set(tracks[:1], own, tracks[1]), 1
-    )
-    scan = scan_of(Link("AT", "PT1"), 3, 0.15, own, received, 0.0)
-    assert scan.numbers.tolist() == [0] and scan.kept == (0,)
-    np.testing.assert_allclose(scan.z, z[1:])
+@pytest.mark.parametrize(
+    ("place", "kept", "change"),
+    [
+        ((9.0, 15.0, 51.0), False, {}),
+        ((9.0, -15.0, 51.0), True, {}),  # behind the AT
+        ((9.0, 15.0, 51.0), True, {"array": Array(rx_x=6, rx_z=6, field_of_view_deg=20.0)}),
+        ((9.0, 15.0, 51.0), True, {"noise": Noise(model="snr", snr_db=-75)}),
+    ],
+)
+def test_what_the_at_would_see_and_has_not_is_no_uav(place, kept, change):
+    """A fused track of the PT alone, where the AT looks, outside its view, or too weak for it; with
+    a track of the AT's, or as a terminal, it stays. Bugs: the AT's own kept by its frames' other
+    links; the field of view left out; noise of any strength."""
+    exchange = Cooperation(prepare(scenario(**change)))
+    poses = exchange._setup.swarm.poses(0.05)
+    state = Gaussian(np.array([*place, 0.0, 0, 0]), np.eye(6))
+    of_pt, of_at = Key("AT->PT", 4), Key("AT->AT", 2)
+    alone = Fused(Name(0.0, *of_pt), state, (of_pt,))
+    assert exchange._refuted(alone, 3, poses) is not kept
+    assert not exchange._refuted(replace(alone, members=(of_pt, of_at)), 3, poses)
+    assert not exchange._refuted(replace(alone, terminal="PT"), 3, poses)
+
+
+def test_a_wall_keeps_what_the_at_cannot_see():
+    """The track stands behind a house of the AT's mesh. Bug: occlusion left out."""
+    exchange = Cooperation(prepare(load(SCENES / "street_canyon.yaml", ["cooperation=tracks"])))
+    poses = exchange._setup.swarm.poses(0.1)
+    key = Key("AT->PT1", 1)
+    for place, kept in (((-5.0, 5.0, 10.0), False), ((-15.0, 5.0, 10.0), True)):
+        state = Gaussian(np.array([*place, 0.0, 0, 0]), np.eye(6))
+        uav = Fused(Name(0.0, *key), state, (key,))
+        assert exchange._refuted(uav, 3, poses) is not kept
 
 
 def noting(reports):

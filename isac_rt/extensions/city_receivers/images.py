@@ -141,7 +141,8 @@ def _by_two(
     pairs, places = met(start[:3], end[:3], normals, offsets, *walls.boxes, *near, reach)
     i, j = pairs.T
     A, B, at_j = places.swapaxes(0, 1)
-    kept = walls.holds(i, A, EDGE) & walls.holds(j, B, EDGE)
+    kept = np.flatnonzero(walls.holds(i, A, EDGE))
+    kept = kept[walls.holds(j[kept], B[kept], EDGE)]
     n, m, at_j = normals[i[kept]], normals[j[kept]], at_j[kept]
     turned = mirror_image(mirror_image(start[3:], n), m)
     return np.hstack([at_j, turned])

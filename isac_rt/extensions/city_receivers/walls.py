@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from isac_rt.world.city.mesh import CityMesh
-from isac_rt.world.mirrors import mirror_image, over_triangle
+from isac_rt.world.mirrors import mirror_image
 from isac_rt.world.passage import hits
 from isac_rt.world.swarm import Pose
 
@@ -55,6 +55,17 @@ class Walls:
             of.reduceat(of.reduce(corners, axis=1), first[:-1]) for of in (np.minimum, np.maximum)
         ]
         return faces, first, np.array(bounds)
+
+    @cached_property
+    def _edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit vectors (F, 3, 3) from the edges of `_faces` inwards, and the edges' places along
+        them (F, 3) [m]."""
+        faces = self._faces[0]
+        corners = self.city.corners[faces] + self.city.origin
+        side = np.roll(corners, -1, axis=1) - corners
+        inward = np.cross(self.city.normals[faces][:, None], side)
+        inward /= np.linalg.norm(inward, axis=2, keepdims=True)
+        return inward, (corners * inward).sum(axis=2)
 
     def near(self, own: Pose, reach: float) -> np.ndarray:
         """Numbers of the mirrors of which something may lie within reach [m] and in front."""
@@ -126,15 +137,15 @@ class Walls:
     def holds(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
         """Return whether points (n, 3) in the planes of mirrors (n,) lie on one of their faces, or
         within `edge` of it."""
-        faces, first, _ = self._faces
+        _, first, _ = self._faces
         count = first[mirrors + 1] - first[mirrors]
         which = np.repeat(np.arange(mirrors.size), count)
         begins = np.cumsum(count) - count
-        face = faces[np.arange(which.size) + np.repeat(first[mirrors] - begins, count)]
-        corners, normals = self.city.corners[face], self.city.normals[face]
-        inside = over_triangle(points[which] - self.city.origin, corners, normals, edge)
+        face = np.arange(which.size) + np.repeat(first[mirrors] - begins, count)
+        inward, least = self._edges
+        inside = np.einsum("nk,nek->ne", points[which], inward[face]) >= least[face] - edge
         out = np.zeros(mirrors.size, bool)
-        out[which[inside]] = True
+        out[which[inside.all(axis=1)]] = True
         return out
 
     def blocking(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:

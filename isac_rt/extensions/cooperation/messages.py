@@ -1,4 +1,4 @@
-"""Messages between terminals about tracks and detections, and the time that a link takes to carry
+"""Messages between terminals about tracks, and the time that a link takes to carry
 them.
 
 An active terminal's messages ride on its data frames, a passive one's go back by its feedback. A
@@ -13,15 +13,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import ceil
 
-import numpy as np
-
 from isac_rt.extensions.city_receivers.out_of_sequence import BATCH
-from isac_rt.extensions.cooperation.centralised import CentralisedTracker, Scan
 from isac_rt.extensions.cooperation.fusion import (
     FusedTracks,
     Report,
     Reported,
-    advance,
     at_once,
     report_of,
 )
@@ -40,12 +36,6 @@ REPORT_BITS = 8 + 16 + 16 + 40 + 120 + 6 * 16 + 15 * 8 + 8
 """A track: whose, number, age, name, mean (24 bits of each position, 16 of each velocity),
 deviations and correlations, and how far the clock moves it; what the errors of the pose do follows
 from the terminal's own place. What these bits round off is not modelled: a centimetre and less."""
-SCAN_BITS = 16 + 16 + 3 * 24 + 3 * 16 + 3 * 16 + 8
-"""Of one frame of a link: which, when, the receiver's position, velocity and attitude, how well its
-clock is known."""
-DETECTION_BITS = 24 + 16 + 2 * 14 + 4 * 8 + 8 + 16 + 1 + 40
-"""Range, rate, two cosines, their deviations, level, number of its track and whether that is
-confirmed, name of the UAV."""
 CODE_RATE = 0.5
 """Share of an active terminal's bits that messages get; the rest protects them."""
 CORRECTED = 0.05
@@ -84,15 +74,13 @@ class Message:
     terminals : what it knows that terminals said of themselves, itself included
     kept : by link
     reports : of tracks, its own and others'
-    scans : detections, its own and others'
-    left_out : tracks or detections that were new and that it had no room for
+    left_out : tracks that were new and that it had no room for
     """
 
     sender: str
     terminals: Mapping[str, SelfReport]
     kept: Mapping[str, Kept]
     reports: Sequence[Report]
-    scans: Sequence[Scan] = ()
     left_out: int = 0
 
     @property
@@ -104,7 +92,6 @@ class Message:
             + TERMINAL_BITS * len(self.terminals)
             + NUMBER_BITS * numbers
             + REPORT_BITS * len(self.reports)
-            + sum(_bits(scan, len(scan)) for scan in self.scans)
         )
 
 
@@ -261,130 +248,3 @@ class Notes(Stateful):
     def ages(self, time: float) -> tuple[float, ...]:
         """Return the ages of what others reported and is still valid [s]."""
         return tuple(time - report.time for report, via in self.reports.values() if via)
-
-
-@dataclass
-class Noted:
-    """State of the detections that a terminal carries over.
-
-    Attributes
-    ----------
-    terminals : what they said of themselves
-    scans : by time and link, and by whom each was said ("": its own)
-    reported_to : by listener what went there
-    """
-
-    terminals: dict[str, SelfReport] = field(default_factory=dict)
-    scans: dict[tuple[float, str], tuple[Scan, str]] = field(default_factory=dict)
-    reported_to: dict[str, set[tuple[float, str]]] = field(default_factory=dict)
-
-
-class Sightings(Stateful):
-    """Detections of others and of the terminal itself, and what it has reported to whom.
-
-    Attributes
-    ----------
-    name : of the terminal
-    tracker : what it makes of all detections
-    """
-
-    def __init__(self, name: str, tracker: CentralisedTracker) -> None:
-        self.name, self.tracker = name, tracker
-        self.state = Noted()
-
-    @property
-    def parts(self) -> Mapping[str, Stateful | None]:
-        return {"tracker": self.tracker}
-
-    @property
-    def terminals(self) -> dict[str, SelfReport]:
-        """Return what terminals reported of themselves."""
-        return self.state.terminals
-
-    def locate(self, time: float, state: Gaussian) -> None:
-        """Take down where it is itself."""
-        self.terminals[self.name] = SelfReport(time, state)
-
-    def see(self, scan: Scan) -> None:
-        """Take down the detections of one of its own links after a frame."""
-        self._take(scan, "")
-        kept, via = self.state.scans[scan.key]
-        self.state.scans[scan.key] = replace(kept, names=self.tracker.names_of(kept)), via
-
-    def receive(self, message: Message) -> None:
-        """Take down what it does not know yet."""
-        for name, own_report in message.terminals.items():
-            known = self.terminals.get(name)
-            if name != self.name and (known is None or own_report.time > known.time):
-                self.terminals[name] = replace(own_report, via=message.sender)
-        for scan in message.scans:
-            if scan.key not in self.state.scans:
-                self._take(scan, message.sender)
-
-    def _take(self, scan: Scan, via: str) -> None:
-        """A scan whose transmitter is not known at all says nothing of places."""
-        self.state.scans[scan.key] = scan, via
-        tx, rx = scan.ends
-        if tx == rx:
-            self.tracker.add(scan, None)
-        elif tx in self.terminals:
-            own_report = self.terminals[tx]
-            self.tracker.add(scan, _moved(own_report.state.mean, scan.time - own_report.time))
-
-    def fuse(self, time: float, acceleration_std: float) -> list[Fused]:
-        """Return the fused tracks at a time [s], without what was not said for `HOLD_S`."""
-        self.state.scans = {k: v for k, v in self.state.scans.items() if time - k[0] <= HOLD_S}
-        self.state.terminals = {k: s for k, s in self.terminals.items() if time - s.time <= HOLD_S}
-        self.tracker.forget(time)
-        known = {
-            name: advance(own_report.state, time - own_report.time, acceleration_std)
-            for name, own_report in self.terminals.items()
-        }
-        return self.tracker.at(time, known)
-
-    def ages(self, time: float) -> tuple[float, ...]:
-        """Return the ages of the detections that others reported and are still valid [s]."""
-        return tuple(
-            time - scan.time
-            for scan, via in self.state.scans.values()
-            if via
-            for _ in range(len(scan))
-        )
-
-    def compose(self, listener: str, capacity: int) -> Message:
-        """Compose the message to a listener over a channel of `capacity` bits a frame: the newest
-        frames first and of each the strongest detections, those of confirmed tracks before all
-        others. What does not fit is not sent later; one detection is sent at least."""
-        terminals = {k: s for k, s in self.terminals.items() if listener not in (k, s.via)}
-        bare = Message(self.name, terminals, {}, [])
-        reported_to = self.state.reported_to.setdefault(listener, set())
-        new = [
-            scan
-            for key, (scan, via) in self.state.scans.items()
-            if listener not in (via, scan.ends[1]) and key not in reported_to
-        ]
-        new.sort(key=lambda scan: (-scan.time, scan.origin))
-        least = bare.bits + (_bits(new[0], min(1, len(new[0]))) if new else 0)
-        capacity_left = ceil(least / capacity) * capacity - bare.bits
-        chosen, left = [], sum(map(len, new))
-        for scan in new:
-            count = min(len(scan), (capacity_left - _bits(scan, 0)) // DETECTION_BITS)
-            if count < min(1, len(scan)):
-                break
-            chosen.append(scan.select(scan.best(count)))
-            capacity_left -= _bits(scan, count)
-            left -= count
-        self.state.reported_to[listener] = (
-            reported_to | {scan.key for scan in new}
-        ) & self.state.scans.keys()
-        return replace(bare, scans=chosen, left_out=left)
-
-
-def _bits(scan: Scan, detections: int) -> int:
-    """Count the bits of a dwell with a number of its detections."""
-    return SCAN_BITS + NUMBER_BITS * len(scan.kept) + DETECTION_BITS * detections
-
-
-def _moved(state: np.ndarray, interval: float) -> np.ndarray:
-    """Position and velocity (6,) after an interval [s] of straight flight."""
-    return np.concatenate([state[:3] + interval * state[3:], state[3:]])

@@ -8,23 +8,23 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from isac_rt.extensions.cooperation.centralised import CentralisedTracker, Scan, TrackManagement
 from isac_rt.extensions.cooperation.fusion import FusedTracks, advance, at_once, in_world, report_of
-from isac_rt.extensions.cooperation.messages import CODE_RATE, CORRECTED, Channel, Notes, Sightings
+from isac_rt.extensions.cooperation.messages import CODE_RATE, CORRECTED, Channel, Notes
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.plain import Stateful
+from isac_rt.propagation.free_space import radar_amplitude
+from isac_rt.propagation.rcs import SMALL_MEAN_DBSM
+from isac_rt.results.losses import Sensitivity
 from isac_rt.results.metrics import SymbolCount
 from isac_rt.results.records import LateRecord
 from isac_rt.results.scoring import LinkResult
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
 from isac_rt.simulation.stations import PREFETCHED_FRAMES
-from isac_rt.track.filter import Ambiguity
 from isac_rt.track.fused import Fused
 from isac_rt.track.parts import ReportedUav, of_itself
 from isac_rt.track.reference import TerminalState
-from isac_rt.track.tracker import in_plane
 from isac_rt.world.swarm import Pose
 
 
@@ -50,14 +50,8 @@ class Cooperation(Stateful):
         links = setup.timetable.all_links
         self._names = list(dict.fromkeys(link.rx for link in links))
         s = setup.scenario
-        self._centralised = s.cooperation == "detections"
-        self._notes: dict[str, Notes | Sightings] = {
-            name: Sightings(name, self._tracker()) if self._centralised else Notes(name)
-            for name in self._names
-        }
-        self._swarm: FusedTracks | CentralisedTracker = (
-            self._tracker() if self._centralised else FusedTracks()
-        )
+        self._notes = {name: Notes(name) for name in self._names}
+        self._swarm = FusedTracks()
         self.state = Talk()
         self._acceleration = s.tracking.acceleration_std_mps2
         self._feedback = int(s.access.feedback_rate_bps * setup.timetable.interval)
@@ -67,17 +61,6 @@ class Cooperation(Stateful):
         return {f"notes of {name}": notes for name, notes in self._notes.items()} | {
             "swarm": self._swarm
         }
-
-    def _tracker(self) -> CentralisedTracker:
-        """A tracker of all terminals' detections."""
-        setup, w = self._setup, self._setup.waveform
-        s = setup.scenario
-        period = s.receivers.active_every_frames * setup.timetable.interval
-        ambiguities = Ambiguity.of(w, 2), Ambiguity.of(w, 1)
-        names = dict.fromkeys([*self._names, *(link.tx for link in setup.timetable.all_links)])
-        return CentralisedTracker(
-            [*names], s.tracking, TrackManagement.of(s.tracking, period), ambiguities
-        )
 
     def step(
         self,
@@ -113,7 +96,7 @@ class Cooperation(Stateful):
             )
             for name, notes in self._notes.items()
         }
-        together = self._together(time, poses)
+        together = self._together(frame, time, poses)
         self.state.known = {
             k: v for k, v in self.state.known.items() if k > frame - PREFETCHED_FRAMES
         }
@@ -143,46 +126,64 @@ class Cooperation(Stateful):
             if uav.terminal not in link
         ]
 
-    def _together(self, time: float, poses: Mapping[str, Pose]) -> list[Fused]:
-        """Return what all terminals know together at a time [s]."""
+    def _together(self, frame: int, time: float, poses: Mapping[str, Pose]) -> list[Fused]:
+        """Return what all terminals know together at a time [s], without what is `_refuted`."""
         known = {name: of_itself(poses[name]) for name in self._notes}
-        if isinstance(self._swarm, CentralisedTracker):
-            self._swarm.forget(time)
-            return self._swarm.at(time, known)
         own = [
             report
             for notes in self._notes.values()
-            if isinstance(notes, Notes)
             for report, via in notes.reports.values()
             if not via
         ]
         words = {name: report_of(state) for name, state in known.items()}
-        return self._swarm.update(at_once(own, time, self._acceleration), words)
+        fused = self._swarm.update(at_once(own, time, self._acceleration), words)
+        return [uav for uav in fused if not self._refuted(uav, frame, poses)]
+
+    def _refuted(self, uav: Fused, frame: int, poses: Mapping[str, Pose]) -> bool:
+        """Return whether fused tracks of passive terminals lie where an active terminal would
+        detect a UAV and has no track. A passive terminal's errors near the line of sight and over
+        unknown paths are larger than it knows: most such tracks are doubles of one that the active
+        terminal has elsewhere."""
+        own = [link for link in self._setup.timetable.links(frame) if link.own]
+        if uav.terminal is not None or {k.origin for k in uav.members} & set(map(str, own)):
+            return False
+        place = uav.state.mean[:3]
+        return any(self._would_detect(link, place, frame, poses) for link in own)
+
+    def _would_detect(
+        self, link: Link, place: np.ndarray, frame: int, poses: Mapping[str, Pose]
+    ) -> bool:
+        """Return whether an active terminal more likely detects a small UAV at a place than not: in
+        its field of view and range, not occluded, by the radar equation in noise."""
+        s, pose = self._setup, poses[link.rx]
+        w, antennas = s.waveform, s.arrays.of(link.rx)
+        distance = float(np.linalg.norm(place - pose.position))
+        towards = pose.to_body((place - pose.position) / distance)
+        if distance > w.num_range_cells * w.range_cell(2) or not antennas.in_view(towards):
+            return False
+        if s.walls.blocking(pose.position, place).size:
+            return False
+        section = 10 ** (SMALL_MEAN_DBSM / 10)
+        amplitude = radar_amplitude(w.wavelength, section, distance, distance)
+        sent, noise = s.transmission(link.tx, frame, pose), s.noise_power(dict(poses), link)
+        sees = Sensitivity.of(
+            w, antennas, s.scenario.receivers, sent, noise, w.num_groups, own=True
+        )
+        snr = (amplitude * antennas.element_gain(towards)) ** 2 * sees.cell
+        return sees.clutter_free(float(snr)) > 0.5
 
     def _see(self, frame: int, link: Link, received: LinkResult) -> None:
-        """A terminal takes down what one of its links shows: its confirmed tracks, or what its
-        tracks rest on."""
+        """A terminal takes down the confirmed tracks of one of its links."""
         setup, tracks = self._setup, received.tracks
         time = setup.timetable.epoch(frame, link.tx)
         own = setup.believed(link.rx, setup.swarm.trajectories[link.rx].pose(time))
         clock = 0.0
         if not link.own:
             clock = SPEED_OF_LIGHT * setup.connections.offset_std(link, time)
-        notes = self._notes[link.rx]
-        if isinstance(notes, Notes):
-            confirmed = (tracks.confirmed & ~tracks.is_reference).nonzero()[0]
-            cell = setup.waveform.range_cell(1)
-            states = {
-                int(tracks.ids[k]): in_world(tracks, int(k), own, clock, cell) for k in confirmed
-            }
-            notes.see(str(link), time, states)
-            return
-        scan = scan_of(link, frame, time, own, received, clock)
-        notes.see(scan)
-        if isinstance(self._swarm, CentralisedTracker):
-            sender = setup.believed(link.tx, setup.swarm.trajectories[link.tx].pose(time))
-            at = None if link.own else np.concatenate([sender.position, sender.velocity])
-            self._swarm.add(scan, at)
+        confirmed = (tracks.confirmed & ~tracks.is_reference).nonzero()[0]
+        cell = setup.waveform.range_cell(1)
+        states = {int(tracks.ids[k]): in_world(tracks, int(k), own, clock, cell) for k in confirmed}
+        self._notes[link.rx].see(str(link), time, states)
 
     def _capacities(self, frame: int) -> dict[Link, int]:
         """Bits that each way from terminal to terminal has for messages in a frame: an active
@@ -251,34 +252,3 @@ class Cooperation(Stateful):
 def _corrected(count: SymbolCount) -> bool:
     """Return whether the code of a frame that was read corrects its errors."""
     return count.bit_errors <= CORRECTED * count.bits_total
-
-
-def scan_of(
-    link: Link, frame: int, time: float, own: Pose, received: LinkResult, clock_std: float
-) -> Scan:
-    """The detections of a frame that a receiver's tracks took. The reference's is left out.
-
-    Parameters
-    ----------
-    time : middle of the frame [s]
-    own : the receiver's pose as it believes it
-    clock_std : deviation of its ranges by its clock [m]
-    """
-    tracks, found = received.tracks, in_plane(received.reception.detections)
-    straight = ~tracks.is_reference
-    mine = (tracks.detection >= 0) & straight
-    rows = tracks.detection[mine]
-    return Scan(
-        str(link),
-        frame,
-        time,
-        own,
-        clock_std,
-        tracks.ids[mine],
-        found.measured[rows],
-        found.std[rows],
-        found.snr[rows],
-        tracks.confirmed[mine],
-        (None,) * len(rows),
-        tuple(tracks.ids[straight].tolist()),
-    )

@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from isac_rt.extensions.cooperation.centralised import CentralisedTracker, Scan, TrackManagement
 from isac_rt.extensions.cooperation.fusion import DATUM_STD, ERRORS, Reported
 from isac_rt.extensions.cooperation.messages import (
-    DETECTION_BITS,
     HEADER_BITS,
     HOLD_S,
     NUMBER_BITS,
     REPORT_BITS,
-    SCAN_BITS,
     TERMINAL_BITS,
     Channel,
     Notes,
-    Sightings,
 )
 from isac_rt.plain import plain
 from isac_rt.storage import pack, unpack
-from isac_rt.track.filter import Ambiguity, Gaussian
+from isac_rt.track.filter import Gaussian
 from isac_rt.track.fused import Key
-from isac_rt.track.settings import Tracking
-from isac_rt.world.swarm import Pose
 
 T = 0.05
 
@@ -210,92 +202,3 @@ def test_a_terminal_that_stops_in_mid_sentence_goes_on_with_it():
     waiting = Channel()
     waiting.restore(unpack(*pack([direction.memory()]))[0])
     assert [m.bits for m in waiting.late(0)] == [outcomes[1][1][0].bits]
-
-
-def scan(frame=0, origin="A->A", count=2, sure=None, snr=None):
-    z = np.array([[30.0, 1, 0.1, 0.0], [40.0, 2, 0.2, 0.0], [50.0, 3, 0.3, 0.0]])[:count]
-    return Scan(
-        origin,
-        frame,
-        T * frame,
-        Pose.at_rest((0, 0, 20)),
-        0.0,
-        np.arange(count),
-        z,
-        np.tile([0.01, 0.05, 2e-3, 2e-3], (count, 1)),
-        np.array(snr or [9.0, 3.0, 5.0][:count]),
-        np.array([True] * count if sure is None else sure),
-        (None,) * count,
-        tuple(range(count)),
-    )
-
-
-def sightings(name):
-    folds = Ambiguity(30.0), Ambiguity(60.0)
-    tracker = CentralisedTracker(("A", "B"), Tracking(), TrackManagement(3, 5 * T, 0.36), folds)
-    out = Sightings(name, tracker)
-    out.locate(0.0, state(0.0))
-    return out
-
-
-def test_the_strongest_of_the_newest_go_first_and_what_does_not_fit_is_not_told_later():
-    """64 + 136 for itself, 208 a frame of a link, 16 a track that it keeps, 165 a detection: 1400
-    bits hold four of five in two frames, the newest three first; of the older the confirmed one,
-    though it is weaker. After that nothing is new. Planted bugs: the oldest first; SNR before what
-    is sure."""
-    a = sightings("A")
-    a.see(scan(0, count=2, sure=[False, True]))
-    a.see(scan(1, count=3))
-    words = a.compose("B", 1400)
-    assert SCAN_BITS == 208 and DETECTION_BITS == 165
-    assert words.bits == 64 + 136 + 2 * 208 + 5 * 16 + 4 * 165 <= 1400
-    assert [(x.frame, x.numbers.tolist()) for x in words.scans] == [(1, [0, 1, 2]), (0, [1])]
-    assert words.left_out == 1
-    assert not a.compose("B", 1300).scans
-    assert len(a.compose("C", 10**5).scans) == 2
-
-
-def test_a_channel_that_is_too_small_gets_one_detection_in_several_frames():
-    """64 + 136 + 208 + 3 x 16 + 165 = 621 bits by 100 a frame: room for 700."""
-    a = sightings("A")
-    a.see(scan(0, count=3))
-    words = a.compose("B", 100)
-    assert words.bits == 621 and words.left_out == 2
-    assert words.scans[0].numbers.tolist() == [0]
-
-
-def test_detections_are_passed_on_but_not_back():
-    """What A says goes by B to C, never to A again; C has A's body and calls it as A does."""
-    a, b, c = (sightings(name) for name in "ABC")
-    a.see(scan(0))
-    b.receive(a.compose("B", 10**5))
-    c.receive(b.compose("C", 10**5))
-    assert not b.compose("A", 10**5).scans and not c.compose("B", 10**5).scans
-    pictures = [[uav.name for uav in x.fuse(T, 3.0)] for x in (a, b, c)]
-    assert pictures[0] == pictures[1] == pictures[2] and len(pictures[0]) == 2
-    assert c.ages(T) == pytest.approx((T, T)) and a.ages(T) == ()
-    assert len(c.fuse(1.0, 3.0)) == 0
-
-
-def test_paths_over_a_transmitter_that_says_nothing_place_nobody():
-    """B's paths are of A's chirps: with A's word for where it is they are bodies."""
-    silent, receiving = sightings("B"), sightings("B")
-    receiving.receive(sightings("A").compose("B", 10**5))
-    for one in (silent, receiving):
-        one.see(replace(scan(0, "A->B"), own=Pose.at_rest((0, 20, 20), (0, -1, 0))))
-    assert len(silent.fuse(T, 3.0)) == 0 and len(receiving.fuse(T, 3.0)) == 2
-
-
-def test_sightings_go_on_from_memory():
-    """Planted bugs: `reported_to`, or who said it, left out."""
-    a, b = sightings("A"), sightings("B")
-    a.see(scan(0))
-    b.receive(a.compose("B", 10**5))
-    b.compose("C", 10**5)
-    again = sightings("B")
-    again.restore(unpack(*pack(b.memory())))
-    a.see(scan(1))
-    for one in (b, again):
-        one.receive(sightings("A").compose("B", 10**5))
-    assert pack(b.memory()) == pack(again.memory())
-    assert not again.compose("C", 10**5).scans and not again.compose("A", 10**5).scans
