@@ -242,7 +242,7 @@ MAX_LINES = {
     "propagation": 4690,
     "signal": 820,
     "receive": 6065,
-    "track": 1901,
+    "track": 1926,
     "scenario": 1835,
     "results": 3695,
     "simulation": 3430,

@@ -125,6 +125,37 @@ def jacobian(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None
     return out
 
 
+def curvature(g: Gaussian, own: Pose, transmitter: np.ndarray | None = None) -> np.ndarray:
+    r"""Return the covariance (..., 4, 4) that the second derivatives of range and range rate add to
+    what is expected of states: :math:`\tfrac12\mathrm{tr}(H_i P H_j P)` (Bar-Shalom, Li and
+    Kirubarajan, "Estimation with applications to tracking and navigation", 10.3.2).
+
+    A board with three rows knows a height to metres and a range to centimetres: linearised at a
+    wrong height, each range seems to tell the height.
+    """
+    x, P = g.mean, g.covariance[..., None, :6, :6]
+    H = _segment_hessian(x[..., :3] - own.position, x[..., 3:6] - own.velocity)
+    if transmitter is not None:
+        H = H + _segment_hessian(x[..., :3] - transmitter[:3], x[..., 3:6] - transmitter[3:6])
+    out = np.zeros((*x.shape[:-1], 4, 4))
+    out[..., :2, :2] = np.einsum("...iab,...jba->...ij", H @ P, H @ P) / 2
+    return out
+
+
+def _segment_hessian(offset: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Second derivatives of (length, rate) of one path segment with respect to relative position
+    and velocity (..., 2, 6, 6)."""
+    r, e = _unit(offset)
+    turn = _segment_jacobian(offset, velocity)[1]
+    mixed = e[..., :, None] * (turn @ velocity[..., None])[..., None, :, 0]
+    rate = np.sum(e * velocity, axis=-1)[..., None, None]
+    H = np.zeros((*e.shape[:-1], 2, 6, 6))
+    H[..., 0, :3, :3] = H[..., 1, :3, 3:] = H[..., 1, 3:, :3] = turn
+    bent = mixed + np.swapaxes(mixed, -1, -2) + rate * turn
+    H[..., 1, :3, :3] = -bent / r[..., None, None]
+    return H
+
+
 def transmitter_jacobian(state: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
     """Derivative of the bistatic `measure` of UAVs (..., 6 or 9) with respect to the
     transmitter's state (S,): (..., 4, S)."""
@@ -386,11 +417,13 @@ def initiate_all(
     R = measurement_covariance(std[which], mean, transmitter)
     back = np.linalg.inv(J[some])
     position = back @ R[:, POSITION[:, None], POSITION] @ np.swapaxes(back, 1, 2)
-    near = np.trace(position, axis1=1, axis2=2) <= INITIAL_POSITION_STD_LIMIT**2
-    which, mean, read, R, position = (a[near] for a in (which, mean, read, R, position))
     P = np.zeros((len(which), 9, 9))
     P[:] = np.diag([0.0] * 3 + [INITIAL_SPEED_STD**2] * 3 + [acceleration_std**2] * 3)
     P[:, :3, :3] = (position + np.swapaxes(position, 1, 2)) / 2
+    along, bent = back[:, :, :1], curvature(Gaussian(mean, P), own, there)[:, :1, :1]
+    P[:, :3, :3] += bent * along * np.swapaxes(along, 1, 2)
+    near = np.trace(P[:, :3, :3], axis1=1, axis2=2) <= INITIAL_POSITION_STD_LIMIT**2
+    which, mean, read, R, P = (a[near] for a in (which, mean, read, R, P))
     rate = np.array([1])
     return which, _updated(Gaussian(mean, P), read, R, rate, own, there, UNAMBIGUOUS)
 

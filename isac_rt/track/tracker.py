@@ -19,6 +19,7 @@ from isac_rt.track.filter import (
     Ambiguity,
     Gaussian,
     costs,
+    curvature,
     expected,
     initiate_all,
     measurement_covariance,
@@ -301,8 +302,8 @@ class Tracker(Stateful):
             mean, covariance = (
                 np.array(part) for part in zip(*(t.state for t in tracks), strict=True)
             )
-            R = measurement_covariance(std[q], mean, transmitter)
             state = Gaussian(mean, covariance)
+            R = measurement_covariance(std[q], mean, transmitter) + curvature(state, own, sender)
             after = update(state, z[q], R, own, sender, ambiguity=self.ambiguity)
             for track, *of_track in zip(tracks, *after, strict=True):
                 track.state = Gaussian(*of_track)
