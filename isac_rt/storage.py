@@ -7,8 +7,8 @@ or container looks, and is taken away with the next file that is written there.
 Data are a tree of words, numbers, lists and mappings as JSON and the bytes of its arrays: reading
 them runs no code. In a file they carry the key under which they are kept and a checksum.
 
-What takes long to prepare is kept in a folder of the user's (`kept`), under a digest of all that it
-depends on, this program included. A file that is bent, cut off or another's is made anew.
+What takes long to prepare is kept in a folder of the user's (`cached`), under a digest of all that
+it depends on, this program included. A file that is bent, cut off or another's is made anew.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ _HEAP = b"GCOL\x01\0\0\0"  # signature and version of a global heap
 MAX_HDF5_DEPTH = 8
 MOST_JSON_BYTES = 16 * 1024**2
 """No file of JSON is larger: nothing but empty lists takes 53 times its size."""
-KEPT = "ISAC_RT_KEPT"
-"""Variable of the environment: folder of what is `kept`; empty: nothing is."""
-KEPT_BYTES = 1024**3
+CACHE_VARIABLE = "ISAC_RT_KEPT"
+"""Variable of the environment: folder of what is `cached`; empty: nothing is."""
+CACHE_BYTES = 1024**3
 LOW_WATER = 0.8
 """When the limit is passed a folder is brought down to this share of it, so that not every write
 has to look."""
@@ -377,10 +377,10 @@ _ROOM: dict[Store, int] = {}
 others put things there too, and a look at thousands of files takes 10 ms."""
 
 
-def kept(what: str, depends_on: Any, make: Callable[[], Any]) -> Any:
+def cached(what: str, depends_on: Any, make: Callable[[], Any]) -> Any:
     """Return what `make` returns, plain data and arrays, or what it returned in an earlier run for
     the same `depends_on`, plain data and arrays too."""
-    named = os.environ.get(KEPT)
+    named = os.environ.get(CACHE_VARIABLE)
     if named is None:
         try:
             user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -395,7 +395,7 @@ def kept(what: str, depends_on: Any, make: Callable[[], Any]) -> Any:
             return make()
     except OSError:
         return make()
-    store = Store(Path(named), ".data", KEPT_BYTES)
+    store = Store(Path(named), ".data", CACHE_BYTES)
     tree, arrays = pack([what, depends_on, program_fingerprint(), versions()])
     key = hashlib.sha256(tree.encode() + b"\n" + arrays).hexdigest()
     found = store.get(key)

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from isac_rt.runtime import RuntimeProblem, choose_backend
-from isac_rt.storage import KEPT
+from isac_rt.storage import CACHE_VARIABLE
 
-os.environ[KEPT] = ""  # tests prepare everything anew, in processes of their own too
+os.environ[CACHE_VARIABLE] = ""  # tests prepare everything anew, in processes of their own too
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

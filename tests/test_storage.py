@@ -209,36 +209,36 @@ def test_what_is_kept_is_found_by_all_that_it_depends_on(tmp_path, monkeypatch):
         made.append(1)
         return {"a": np.arange(4.0), "n": len(made)}
 
-    monkeypatch.setenv(storage.KEPT, str(tmp_path / "kept"))
-    first = storage.kept("x", ["y", np.arange(3)], make)
-    again = storage.kept("x", ["y", np.arange(3)], make)
+    monkeypatch.setenv(storage.CACHE_VARIABLE, str(tmp_path / "kept"))
+    first = storage.cached("x", ["y", np.arange(3)], make)
+    again = storage.cached("x", ["y", np.arange(3)], make)
     assert (first["n"], again["n"], len(made)) == (1, 1, 1)
     assert np.array_equal(again["a"], first["a"])
-    storage.kept("z", ["y", np.arange(3)], make)
-    storage.kept("x", ["y", np.arange(1, 4)], make)
-    storage.kept("x", ["y", np.arange(3.0)], make)
+    storage.cached("z", ["y", np.arange(3)], make)
+    storage.cached("x", ["y", np.arange(1, 4)], make)
+    storage.cached("x", ["y", np.arange(3.0)], make)
     assert len(made) == 4
     monkeypatch.setattr(storage, "program_fingerprint", lambda: "another")
-    assert storage.kept("x", ["y", np.arange(3)], make)["n"] == 5
+    assert storage.cached("x", ["y", np.arange(3)], make)["n"] == 5
     (tmp_path / "file").write_text("")
     for folder in ("", str(tmp_path / "file" / "below")):
-        monkeypatch.setenv(storage.KEPT, folder)
-        assert storage.kept("x", ["y", np.arange(3)], make)["n"] == len(made)
+        monkeypatch.setenv(storage.CACHE_VARIABLE, folder)
+        assert storage.cached("x", ["y", np.arange(3)], make)["n"] == len(made)
 
 
 def test_what_others_could_have_kept_is_not_taken(tmp_path, monkeypatch):
     """A checksum is no signature: who may write there could keep wrong numbers under a right one.
     Planted bug: a group of many taken for one's own."""
     folder = tmp_path / "kept"
-    monkeypatch.setenv(storage.KEPT, str(folder))
-    assert storage.kept("x", "y", lambda: 1) == 1
-    assert storage.kept("x", "y", lambda: 2) == 1
+    monkeypatch.setenv(storage.CACHE_VARIABLE, str(folder))
+    assert storage.cached("x", "y", lambda: 1) == 1
+    assert storage.cached("x", "y", lambda: 2) == 1
     for mode, private, taken in ((0o777, True, False), (0o775, False, False), (0o775, True, True)):
         storage.is_own_folder.cache_clear()
         folder.chmod(mode)
         monkeypatch.setattr(storage, "_is_private_group", lambda group, own=private: own)
         with nullcontext() if taken else pytest.warns(storage.CacheWarning, match="by others"):
-            assert storage.kept("x", "y", lambda: 2) == (1 if taken else 2)
+            assert storage.cached("x", "y", lambda: 2) == (1 if taken else 2)
 
 
 def test_a_store_keeps_to_its_limit_and_lets_the_oldest_go(tmp_path):

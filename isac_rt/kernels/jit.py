@@ -31,7 +31,7 @@ from isac_rt.storage import is_own_folder
 _LOG = logging.getLogger(__name__)
 CACHE = "ISAC_RT_CACHE"
 """Variable of the environment: folder of the machine code."""
-KEPT = 8
+MAX_CACHES = 8
 """Sources of a module whose machine code is kept, the last used."""
 FAST = ("contract", "nnan", "ninf", "nsz")
 """Freedoms of the compiler that do not depend on the vector width."""
@@ -200,7 +200,7 @@ def cache_folder(module: str) -> Path | None:
         others = sorted(folder.parent.glob(f"{short}-*"), key=lambda f: f.stat().st_mtime)
     except (OSError, RuntimeError):
         return None
-    for old in others[:-KEPT]:
+    for old in others[:-MAX_CACHES]:
         shutil.rmtree(old, ignore_errors=True)
     return folder
 

@@ -16,7 +16,7 @@ TABLE_STEPS = 32
 """Entries per cell of the tables of responses."""
 LEAST_WEIGHT = 1e-3
 """Scatterers weaker in a cell than this share of the noise are left out of its covariance."""
-TOGETHER = 8
+SCATTERERS_PER_BATCH = 8
 """Scatterers that are added to a covariance at once."""
 
 
@@ -239,7 +239,8 @@ def _within(channels_read, count, begin, lines, total, step, other):
 
 @jit(fast=True)
 def covariances(cells, scatterers, tables, shape, out):
-    """`covariance.fill_covariances` of the city receivers, `TOGETHER` scatterers at a time."""
+    """`covariance.fill_covariances` of the city receivers, `SCATTERERS_PER_BATCH` scatterers at a
+    time."""
     rows, bins, num_bins = cells
     start, beat, doppler, power, steer = scatterers
     size = steer.shape[1]
@@ -252,7 +253,10 @@ def covariances(cells, scatterers, tables, shape, out):
             if k % TABLE_STEPS == TABLE_STEPS // 2:  # between two cells
                 most[axis, cell - 1] = max(most[axis, cell - 1], tables[axis][k])
     # what lies beyond the channels stays zero
-    re, im = np.zeros(TOGETHER * width, np.float32), np.zeros(TOGETHER * width, np.float32)
+    re, im = (
+        np.zeros(SCATTERERS_PER_BATCH * width, np.float32),
+        np.zeros(SCATTERERS_PER_BATCH * width, np.float32),
+    )
     sums = np.zeros((2, size, width), np.float32)
     for c in range(rows.size):
         sums[:], count = 0.0, 0
@@ -276,7 +280,7 @@ def covariances(cells, scatterers, tables, shape, out):
                         re[count * width + k] = steer[s, k].real * root
                         im[count * width + k] = steer[s, k].imag * root
                     count += 1
-                    if count == TOGETHER:
+                    if count == SCATTERERS_PER_BATCH:
                         _add_products(re, im, count, size, sums)
                         count = 0
         _add_products(re, im, count, size, sums)

@@ -62,7 +62,7 @@ from isac_rt.kernels.vector import (
     zip_high,
     zip_low,
 )
-from isac_rt.storage import kept
+from isac_rt.storage import cached
 
 OVERSAMPLING, WIDTH = 1.5, 12
 """Grid points per sample, at least, and per path. What noise covers is spread on `TAPS` of them."""
@@ -110,7 +110,7 @@ def grid_size(num_samples: int, oversampling: float, width: int) -> int:
 def weights(num_samples: int, oversampling: float, width: int, faint: int = 0) -> Kernel:
     """As `_weights`, which takes as long as two cubes, or as an earlier run kept them."""
     of = num_samples, oversampling, width, faint
-    return Kernel(*kept("grid weights", of, lambda: list(_weights(*of))))
+    return Kernel(*cached("grid weights", of, lambda: list(_weights(*of))))
 
 
 def _weights(num_samples: int, oversampling: float, width: int, faint: int) -> Kernel:

@@ -233,7 +233,7 @@ def receiver_search(antennas: Antennas, wavenumber: float) -> Search:
 
 
 @dataclass(frozen=True)
-class Found:
+class DirectionPeaks:
     """The largest statistic of some cells and where it lies.
 
     Attributes
@@ -248,7 +248,7 @@ class Found:
     cosines: np.ndarray
 
 
-def search_plain(x: np.ndarray, search: Search, noise: float, least: float) -> Found:
+def search_plain(x: np.ndarray, search: Search, noise: float, least: float) -> DirectionPeaks:
     """Return the largest T of cells against noise alone; exact where it is `least` / `PRUNED` or
     more. Below it is that of the grid, or a bound without a direction.
 
@@ -278,7 +278,7 @@ def search_plain(x: np.ndarray, search: Search, noise: float, least: float) -> F
     some = some[above]
     statistic = statistic_of(y[above], scale=scale)
     peak[some], cosines[some] = climbed(statistic, cosines[some], search)
-    return Found(cell, peak, cosines)
+    return DirectionPeaks(cell, peak, cosines)
 
 
 def _axis_bound(x: np.ndarray, search: Search) -> np.ndarray:
@@ -296,7 +296,7 @@ def _axis_bound(x: np.ndarray, search: Search) -> np.ndarray:
 
 def search_white(
     x: np.ndarray, R: np.ndarray, cell: np.ndarray, search: Search, least: float = 0.0
-) -> tuple[Found, np.ndarray]:
+) -> tuple[DirectionPeaks, np.ndarray]:
     """Return the largest T of cells with covariances, that of the grid where it is below `least`;
     and how much wider than in noise it scatters, 1 + (T - 1) c with c the share of clutter in the
     beam's power.
@@ -316,7 +316,7 @@ def search_white(
     a = search.steering(cosines)
     white = np.einsum("sij,sj->si", inverse, a)
     share = 1 - (np.abs(white) ** 2).sum(axis=1) / (a.conj() * white).sum(axis=1).real
-    return Found(cell, peak, cosines), 1 + (x.shape[1] - 1) * np.clip(share, 0, 1)
+    return DirectionPeaks(cell, peak, cosines), 1 + (x.shape[1] - 1) * np.clip(share, 0, 1)
 
 
 def statistic_of(
@@ -365,12 +365,14 @@ def settled(
         most = values.max(axis=1, keepdims=True).astype(float)
         g = np.log(np.maximum(values / np.maximum(most, 1e-300), 1e-6)).reshape(-1, 3, 3)
         slope = np.stack([g[:, 2, 0] - g[:, 1, 0], g[:, 0, 2] - g[:, 0, 1]], axis=1) / 2
-        bend = np.stack([g[:, 1:, 0].sum(axis=1), g[:, 0, 1:].sum(axis=1)], axis=1)
-        bend = np.where(search.observed, bend - 2 * g[:, :1, 0], -1.0)
+        curvature = np.stack([g[:, 1:, 0].sum(axis=1), g[:, 0, 1:].sum(axis=1)], axis=1)
+        curvature = np.where(search.observed, curvature - 2 * g[:, :1, 0], -1.0)
         mixed = (g[:, 2, 2] - g[:, 2, 1] - g[:, 1, 2] + g[:, 1, 1]) / 4
-        det = bend.prod(axis=1) - mixed**2
-        peaked = (bend < 0).all(axis=1) & (det > 0)
-        move = (mixed[:, None] * slope[:, ::-1] - bend[:, ::-1] * slope) / det.clip(1e-30)[:, None]
+        det = curvature.prod(axis=1) - mixed**2
+        peaked = (curvature < 0).all(axis=1) & (det > 0)
+        move = (mixed[:, None] * slope[:, ::-1] - curvature[:, ::-1] * slope) / det.clip(1e-30)[
+            :, None
+        ]
         move = np.where(peaked[:, None], move, np.sign(slope))  # beside the peak: uphill
         u += half * search.beam * np.clip(move, -3, 3)
     return u

@@ -44,7 +44,7 @@ MOST_CELLS = 100_000
 Metres = Annotated[float, Field(ge=-1e8, le=1e8)]
 Range = tuple[Metres, Metres]
 FromFrame = Literal["boxes", "mask", "range_azimuth", "range_doppler", "cube"]
-Kept = Literal["map", "paths", "detections", "tracks", "bits", FromFrame, "samples"]
+SampleField = Literal["map", "paths", "detections", "tracks", "bits", FromFrame, "samples"]
 
 
 class Draw(Free):
@@ -171,7 +171,7 @@ class DataSet(Free):
         {"train": 0.7, "val": 0.15, "test": 0.15}
     )
     """Shares of the scenes, by the name of the split."""
-    keep: tuple[Kept, ...] = ("map", "paths", "detections", "tracks", "bits")
+    keep: tuple[SampleField, ...] = ("map", "paths", "detections", "tracks", "bits")
     """Parts kept of every frame and link beside the truth. Receivers run only for `map`,
     `detections` and `tracks`; `samples`, `range_doppler` and `cube` are large."""
     about: dict[Literal["license", "creator", "url"], str] = Field({})

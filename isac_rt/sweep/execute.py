@@ -55,7 +55,7 @@ FREE_BYTES = 1_000_000
 """Free disk without which no point is begun. [bytes]"""
 CACHE_BYTES = 4 * 1024**3
 
-KEPT = ("links", "terminals", "swarm", "compared", "paths", "fidelity", "timing_s", "versions")
+PARTS = ("links", "terminals", "swarm", "compared", "paths", "fidelity", "timing_s", "versions")
 """What an outcome holds of a summary."""
 BESIDE = ("shard", "by_frame")
 """What some jobs make beside it."""
@@ -159,7 +159,7 @@ def _outcome(job: Job) -> dict[str, Any]:
     about: dict[str, Any] = {"scenario": job.tree}
     try:
         made = job.simulate()
-        about |= {"status": "done", **{name: made[name] for name in KEPT + BESIDE if name in made}}
+        about |= {"status": "done", **{name: made[name] for name in PARTS + BESIDE if name in made}}
         json.dumps(about, allow_nan=False)
     except Exception as problem:
         if of_machine(problem):

@@ -17,7 +17,7 @@ import numpy as np
 from isac_rt.results.files import ResultsError, with_new_names
 from isac_rt.runtime import shortly
 from isac_rt.storage import BAD_DATA, MOST_JSON_BYTES, read_whole
-from isac_rt.sweep.drawn import Kept
+from isac_rt.sweep.drawn import SampleField
 
 CARD = "card.json"
 AXES = ("map_range", "map_velocity", "u_x")
@@ -50,7 +50,7 @@ class Samples:
             raise ResultsError(
                 f"{folder} has no split {split}; there are {', '.join(card['splits'])}"
             )
-        known = [*card.get("data_set", {}).get("keep", get_args(Kept)), *AXES]
+        known = [*card.get("data_set", {}).get("keep", get_args(SampleField)), *AXES]
         if unknown := [name for name in keep or () if name not in known]:
             raise ResultsError(
                 f"{folder} has no part {', '.join(unknown)}; it has {', '.join(known)}"

@@ -47,7 +47,7 @@ def of_itself(own: Pose) -> Gaussian:
 
 
 @dataclass(frozen=True)
-class Own:
+class Ownship:
     """Knowledge of a terminal about a frame besides its samples.
 
     Attributes
@@ -96,21 +96,21 @@ class Own:
 class TrackRule(Stateful):
     """A rule that keeps false tracks out; by itself it allows all."""
 
-    def candidates(self, detections: Detections, own: Own) -> Detections:
+    def candidates(self, detections: Detections, own: Ownship) -> Detections:
         """Return the detections, of which fewer may start a track."""
         return detections
 
-    def prune(self, tracker: Tracker, own: Own) -> None:
+    def prune(self, tracker: Tracker, own: Ownship) -> None:
         """End tracks of the frame, or take their confirmation back."""
 
 
-def follow(tracker: Tracker, rules: Sequence[TrackRule], detections: Detections, own: Own) -> None:
-    """Update the tracks by one frame's detections, and start and end them by the rules."""
+def follow(tracker: Tracker, rules: Sequence[TrackRule], found: Detections, own: Ownship) -> None:
+    """Update the tracks by what was `found` in a frame, and start and end them by the rules."""
     tentative = frozenset(t.id for t in tracker.tracks if not t.confirmed)
     own = replace(own, tentative=tentative)
     for rule in rules:
-        detections = rule.candidates(detections, own)
-    tracker.update(detections, own.pose, None if own.reference is None else own.reference.state)
+        found = rule.candidates(found, own)
+    tracker.update(found, own.pose, None if own.reference is None else own.reference.state)
     for rule in rules:
         rule.prune(tracker, own)
 
@@ -135,7 +135,7 @@ class HardwareModel(Stateful):
         return cube
 
     def learn_from(
-        self, reception: Reception, own: Own, tracker: Tracker, reference: Track | None
+        self, reception: Reception, own: Ownship, tracker: Tracker, reference: Track | None
     ) -> None:
         """Learn from a frame, and correct the tracks by what was learned."""
 
@@ -169,14 +169,14 @@ class OtherPaths(Stateful):
         """True if a path is known over which data are read."""
         return False
 
-    def take_over(self, reference: Prediction, own: Own) -> None:
+    def take_over(self, reference: Prediction, own: Ownship) -> None:
         """Go on over a reference that is no line of sight, row 0, from the next frame on."""
 
     def read_frame(
         self,
         cube: IFCube,
         reception: Reception,
-        own: Own,
+        own: Ownship,
         reference: Reference,
         *,
         refused: bool,

@@ -34,7 +34,7 @@ from isac_rt.track.filter import Ambiguity
 from isac_rt.track.parts import (
     Equipment,
     Late,
-    Own,
+    Ownship,
     ReportedUav,
     delayed,
     follow,
@@ -154,7 +154,7 @@ class ActiveTerminal(Stateful):
         if clutter is not None and before is not None:
             clutter = before.apply(clutter)
         self.tracker.predict(time)
-        own = Own(own_pose, time, reported_poses, reports)
+        own = Ownship(own_pose, time, reported_poses, reports)
         self._hints = Hints(clutter)
         reception = _reception(self.receive(cube, payload, clutter, maps))
         if reception.correction is not None:
@@ -252,7 +252,7 @@ class PassiveTerminal(Stateful):
         cube = self.equipment.hardware.correct(cube, time)
         self.reference.predict(time)
         self.tracker.predict(time)
-        own = self._own(Own(own_pose, time, reported_poses, reports), sender)
+        own = self._own(Ownship(own_pose, time, reported_poses, reports), sender)
         self._hints = Hints(own.clutter)
         self._hand_over(own)
         reception = self._read(cube, own, modulated, maps)
@@ -278,7 +278,7 @@ class PassiveTerminal(Stateful):
         self.equipment.hardware.learn_from(reception, own, self.tracker, self.reference.track)
         return reception, tracks
 
-    def _own(self, own: Own, sender: Pose | None) -> Own:
+    def _own(self, own: Ownship, sender: Pose | None) -> Ownship:
         """Return what is known of a frame with where the transmitter is, and with the clutter that
         the mesh returns of it from there."""
         over_other_path = sender is not None and self.equipment.other_paths.is_reading
@@ -298,7 +298,7 @@ class PassiveTerminal(Stateful):
         )
         return replace(own, clutter=clutter)
 
-    def _hand_over(self, own: Own) -> None:
+    def _hand_over(self, own: Ownship) -> None:
         """Go on over the reference as over another path where it is not as long as the straight one
         from where the transmitter reports to be."""
         if self.reference.track is not None and own.sender is not None:
@@ -313,7 +313,7 @@ class PassiveTerminal(Stateful):
         tracks = self.tracker.snapshot(own, track or self.reference.state.report)
         return tracks if track is not None else tracks.select(~tracks.is_reference)
 
-    def _read(self, cube: IFCube, own: Own, modulated: bool, maps: bool) -> Reception:
+    def _read(self, cube: IFCube, own: Ownship, modulated: bool, maps: bool) -> Reception:
         """Receive a frame; where symbols outside the alphabet show a slip, move the reference by
         whole cells and receive it again."""
         order = self._receiver.reader.order
@@ -336,14 +336,14 @@ class PassiveTerminal(Stateful):
         return again
 
     def _receive(
-        self, cube: IFCube, expected: Prediction | None, own: Own, modulated: bool, maps: bool
+        self, cube: IFCube, expected: Prediction | None, own: Ownship, modulated: bool, maps: bool
     ) -> Reception:
         """`receive` between clocks that are set alike."""
         late = None if expected is None else delayed(expected, own.clock)
         reception = _reception(self.receive(cube, late, modulated, maps))
         return replace(reception, detections=delayed(reception.detections, own.clock, -1))
 
-    def _track(self, reception: Reception, own: Own) -> None:
+    def _track(self, reception: Reception, own: Ownship) -> None:
         """Carry on the reflectors' tracks and start new ones, where the frame shows the transmitter
         or its data say where it is."""
         if reception.line_of_sight:

@@ -13,7 +13,7 @@ import numpy as np
 
 from isac_rt.plain import plain, restored
 from isac_rt.settings import plain_tree
-from isac_rt.storage import kept
+from isac_rt.storage import cached
 from isac_rt.world import settings
 from isac_rt.world.city import CityMesh, city_files, load_city
 
@@ -58,7 +58,7 @@ def _loaded_city(
         return load_city(tree, folder, carrier, centre)
     return restored(
         CityMesh,
-        kept(
+        cached(
             "city",
             [text, digest, carrier, centre],
             lambda: plain(load_city(tree, folder, carrier, centre)),

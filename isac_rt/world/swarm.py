@@ -162,8 +162,8 @@ class Trajectory:
         times = np.array([start, end])
         if self._spline is not None:
             breakpoints = self._spline.x[(self._spline.x > start) & (self._spline.x < end)]
-            bends = np.linalg.norm(self._spline(np.clip(self._spline.x, start, end), 2), axis=1)
-            count = int((end - start) * np.sqrt(bends.max() / (8 * SAG_M))) + 2
+            curvature = np.linalg.norm(self._spline(np.clip(self._spline.x, start, end), 2), axis=1)
+            count = int((end - start) * np.sqrt(curvature.max() / (8 * SAG_M))) + 2
             times = np.union1d(np.linspace(start, end, min(count, MAX_POINTS)), breakpoints)
         return times, np.array([self.pose(float(t)).position for t in times])
 

@@ -291,7 +291,7 @@ def test_chains_are_found_again_and_only_where_nothing_changed(streets, tmp_path
     has the same chains; other rays, another flight and another mesh are searched anew. Planted bug:
     a key without the places."""
     from isac_rt.propagation.segments.chains import Search
-    from isac_rt.storage import KEPT
+    from isac_rt.storage import CACHE_VARIABLE
     from isac_rt.world.city import scene as scenes
 
     frames, s, city = streets
@@ -309,7 +309,7 @@ def test_chains_are_found_again_and_only_where_nothing_changed(streets, tmp_path
 
     plain = chains(few, city)
     monkeypatch.setattr(Search, "_sent", lambda *at: sent.append(at) or search(*at))
-    monkeypatch.setenv(KEPT, str(tmp_path))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     for again in (False, True):
         monkeypatch.setattr(scenes, "_latest", None)
         found = chains(few, city)

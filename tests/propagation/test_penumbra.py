@@ -116,7 +116,7 @@ def powers(model, flight, city, times, lift: float = 0.02):
         # what faces away is dark, though a ray from its inner side may bend
         asked = np.flatnonzero((front > 0) | (rays > 0))
         lifted = cells.points[asked] + lift * np.sign(front[asked])[:, None] * n[asked]
-        nu = edges.bends(np.broadcast_to(place, lifted.shape), lifted).nu
+        nu = edges.diffractions(np.broadcast_to(place, lifted.shape), lifted).nu
         truth = np.zeros(len(cells))
         truth[asked] = np.where(np.isinf(nu), nu < 0, np.abs(edge_factor(np.clip(nu, -30, 30))))
         blend = np.zeros(len(cells))

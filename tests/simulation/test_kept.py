@@ -16,7 +16,7 @@ from isac_rt.propagation.clutter import field as clutter_field
 from isac_rt.propagation.clutter import visibility as sight
 from isac_rt.propagation.clutter.field import in_local
 from isac_rt.simulation.setup import prepare
-from isac_rt.storage import KEPT, pack
+from isac_rt.storage import CACHE_VARIABLE, pack
 from isac_rt.world import area
 from isac_rt.world.city import mesh
 
@@ -87,7 +87,7 @@ def place(tmp_path, monkeypatch):
     quarter = Path(__file__).parents[2] / "scenes/data/quarter.geojson"
     shutil.copy(quarter, tmp_path / "quarter.geojson")
     monkeypatch.setattr(mesh, "MIN_CACHED_FACES", 10)
-    monkeypatch.setenv(KEPT, str(tmp_path / "kept"))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "kept"))
     return tmp_path
 
 
@@ -95,10 +95,10 @@ def test_what_is_kept_is_what_would_be_prepared(place, monkeypatch):
     """Each change of a scenario, after the unchanged one was kept: the bytes are those of a set-up
     without a store. Planted bugs: a key without the seed, the materials, the poses or the noise;
     sight kept by its time samples alone, without its points."""
-    monkeypatch.setenv(KEPT, str(place / "kept"))
+    monkeypatch.setenv(CACHE_VARIABLE, str(place / "kept"))
     first = prepared(place, {})
     found = {name: prepared(place, change) for name, change in CHANGES.items()}
-    monkeypatch.setenv(KEPT, "")
+    monkeypatch.setenv(CACHE_VARIABLE, "")
     for name, change in CHANGES.items():
         assert found[name] == prepared(place, change), name
     assert found["nothing"] == first

@@ -147,7 +147,7 @@ def test_initiation_refuses_what_fixes_no_position():
     assert start(np.array([short, 1.0, 0.2, 0.1]), transmitter=at) is None
 
 
-def test_nothing_is_born_in_the_very_place_of_the_transmitter():
+def test_no_track_starts_in_the_very_place_of_the_transmitter():
     """It has no direction from there. A length next to the baseline's puts a body there by
     rounding. Planted bug: the Jacobian not asked, which then is not a number and no matrix to
     invert."""

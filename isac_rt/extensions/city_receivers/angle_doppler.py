@@ -33,7 +33,7 @@ from isac_rt.receive.cfar import (
 )
 from isac_rt.receive.directions import (
     PRUNED,
-    Found,
+    DirectionPeaks,
     Search,
     channel_search,
     inverses,
@@ -217,7 +217,7 @@ class AngleDoppler:
         ratio, sure = np.zeros((2, power.size), np.float32)
         cosines = np.full((power.size, 2), np.nan)
 
-        def note(found: Found) -> None:
+        def note(found: DirectionPeaks) -> None:
             ratio[found.cell], sure[found.cell] = (found.peak / limit for limit in limits)
             cosines[found.cell] = found.cosines
 

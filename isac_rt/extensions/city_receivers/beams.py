@@ -213,9 +213,9 @@ def rate_error(
     ]
     i = int(np.clip(np.argmax(fit), 1, VELOCITY_STEPS - 2))
     before, peak, after = fit[i - 1 : i + 2]
-    bend = before - 2 * peak + after
+    second = before - 2 * peak + after
     return float(
-        rates[i] + (0.5 * (before - after) / bend if bend < 0 else 0.0) * (rates[1] - rates[0])
+        rates[i] + (0.5 * (before - after) / second if second < 0 else 0.0) * (rates[1] - rates[0])
     )
 
 

@@ -44,7 +44,7 @@ MIN_SPACING = 3
 """Half cells on each side of a cell that is kept in which no further one is."""
 FASTEST = 45.0
 """Rate of a path's length within which it is sought [m/s]."""
-BENDS, BENT = (-12.0, -6.0, 0.0, 6.0, 12.0), 6.0
+CURVATURES, BENT = (-12.0, -6.0, 0.0, 6.0, 12.0), 6.0
 """Accelerations of the length that are tried, and their standard deviation [m/s^2]."""
 FALSE_RATE = 1e-6
 """Chance that noise makes a chirp count."""
@@ -197,7 +197,7 @@ def acquire(batch: Sequence[Peaks], antennas: Antennas, order: int) -> DataPath 
     w = batch[0].waveform
     direction = _direction(batch, antennas, w)
     weights = _weights(direction, antennas, w)
-    seen = [_Seen.of(one, weights, batch[-1].time) for one in batch]
+    seen = [_Chirps.of(one, weights, batch[-1].time) for one in batch]
     fit = _comb([one for one in seen if one.modulated], w)
     if fit is None:
         return None
@@ -274,7 +274,7 @@ def read_peaks(
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Chirps:
     """The chirps of a frame that stand out in the beam towards a path.
 
     Attributes
@@ -291,7 +291,7 @@ class _Seen:
     cell: np.ndarray
 
     @classmethod
-    def of(cls, peaks: Peaks, weights: np.ndarray, last: float) -> _Seen:
+    def of(cls, peaks: Peaks, weights: np.ndarray, last: float) -> _Chirps:
         """Return the peaks of a frame, its middle counted from time `last`."""
         power = np.abs(peaks.values @ weights) ** 2
         best = power.argmax(axis=-1)[..., None]
@@ -308,8 +308,8 @@ def _threshold(waveform: Waveform) -> float:
 
 def _vertex(before: np.ndarray, peak: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Where a parabola through three points has its top, in steps from the middle."""
-    bend = np.minimum(before - 2 * peak + after, -1e-300)
-    return np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
+    curvature = np.minimum(before - 2 * peak + after, -1e-300)
+    return np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)
 
 
 def _offset(before: np.ndarray, peak: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -344,7 +344,7 @@ def _direction(batch: Sequence[Peaks], antennas: Antennas, waveform: Waveform) -
     return settled(power, start, search)[0]
 
 
-def _comb(seen: Sequence[_Seen], waveform: Waveform) -> tuple[np.ndarray, np.ndarray] | None:
+def _comb(seen: Sequence[_Chirps], waveform: Waveform) -> tuple[np.ndarray, np.ndarray] | None:
     """Fraction, rate and acceleration [cells, cells/s, cells/s^2] at the last frame that most
     chirps share, and their covariance; None where they share none."""
     count = sum(one.cell.size for one in seen)
@@ -353,24 +353,24 @@ def _comb(seen: Sequence[_Seen], waveform: Waveform) -> tuple[np.ndarray, np.nda
     w, cell = waveform, waveform.range_cell(1)
     span = max(-min(one.middle for one in seen), w.frame_duration)
     rates = np.linspace(-1, 1, 2 * int(np.ceil(4 * FASTEST / cell * span)) + 1) * FASTEST / cell
-    bends = np.array(BENDS) / cell
+    curvatures = np.array(CURVATURES) / cell
     coarse = np.linspace(-1, 1, 2 * int(np.ceil(4 * FASTEST / cell * w.frame_duration)) + 1)
     coarse = coarse * FASTEST / cell  # within a frame
     nearest = np.abs(rates[:, None] - coarse).argmin(axis=1)
-    total = np.zeros((rates.size, bends.size), np.complex128)
+    total = np.zeros((rates.size, curvatures.size), np.complex128)
     within = np.zeros(coarse.size)
     for one in seen:
         inside = np.exp(2j * np.pi * (one.cell - coarse[:, None] * one.time)).sum(axis=1)
-        moved = rates[:, None] * one.middle + bends * (one.middle**2 / 2)
+        moved = rates[:, None] * one.middle + curvatures * (one.middle**2 / 2)
         total += inside[nearest, None] * np.exp(-2j * np.pi * moved)
         within += np.abs(inside) ** 2
     gaps = np.diff([one.middle for one in seen if one.cell.size])
     if gaps.size:  # whole cells from frame to frame turn nothing but the frames' own rates
         own = _own_rate(seen, float(coarse[within.argmax()]))
         middle = sum(one.middle * one.cell.size for one in seen) / count
-        total[np.abs(rates[:, None] + bends * middle - own) > 0.5 / gaps.min()] = 0
+        total[np.abs(rates[:, None] + curvatures * middle - own) > 0.5 / gaps.min()] = 0
     i, j = np.unravel_index(np.abs(total).argmax(), total.shape)
-    state = np.array([np.angle(total[i, j]) / (2 * np.pi), rates[i], bends[j]])
+    state = np.array([np.angle(total[i, j]) / (2 * np.pi), rates[i], curvatures[j]])
     time = np.concatenate([one.middle + one.time for one in seen])
     cells = np.concatenate([one.cell for one in seen])
     design = np.stack([np.ones(count), time, time**2 / 2], axis=1)
@@ -393,7 +393,7 @@ def _comb(seen: Sequence[_Seen], waveform: Waveform) -> tuple[np.ndarray, np.nda
     return state, covariance
 
 
-def _own_rate(seen: Sequence[_Seen], rate: float) -> float:
+def _own_rate(seen: Sequence[_Chirps], rate: float) -> float:
     """Rate [cells/s] at which cells move within frames, whatever they do from one to the next."""
     time = np.concatenate([one.time for one in seen])
     for _ in range(4):
@@ -408,7 +408,7 @@ def _own_rate(seen: Sequence[_Seen], rate: float) -> float:
     return rate
 
 
-def _whole_cells(seen: Sequence[_Seen], state: np.ndarray, symbols: int) -> int | None:
+def _whole_cells(seen: Sequence[_Chirps], state: np.ndarray, symbols: int) -> int | None:
     """The whole cells that a path's beat has besides; None if more than one number can be.
 
     A chirp that shows another path lies anywhere, half of the time outside the alphabet. So a shift

@@ -17,7 +17,7 @@ from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.clutter.cells import Density
-from isac_rt.propagation.clutter.field import ClutterField, Seen
+from isac_rt.propagation.clutter.field import ClutterField, Visible
 from isac_rt.propagation.clutter.merging import NoiseFloor
 from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.propagation.settings import Clutter
@@ -118,7 +118,7 @@ class MeshExpectation:
         return ExpectedClutter.joined(parts)
 
 
-def _expected(seen: Seen, amplitude: np.ndarray, axes: Pose) -> ExpectedClutter:
+def _expected(seen: Visible, amplitude: np.ndarray, axes: Pose) -> ExpectedClutter:
     """Clutter of scatterers (K,) with amplitudes (K,) where antennas were isotropic, directions in
     the body's axes of a pose."""
     power = (amplitude * seen.magnitude) ** 2

@@ -26,7 +26,7 @@ from isac_rt.frame.antennas import Antennas, folded, resolutions
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import Ambiguity, measure, wrapped
-from isac_rt.track.parts import Own, TrackRule
+from isac_rt.track.parts import Ownship, TrackRule
 from isac_rt.track.tracker import Track, Tracker, TrackSet, track_set
 from isac_rt.world.swarm import Pose
 
@@ -78,11 +78,11 @@ class Ghosts(TrackRule):
         self._alone = np.zeros(0, bool)
         self.state = Echoed()
 
-    def candidates(self, detections: Detections, own: Own) -> Detections:
+    def candidates(self, detections: Detections, own: Ownship) -> Detections:
         self._alone = alone(detections, self._leeway)
         return detections
 
-    def prune(self, tracker: Tracker, own: Own) -> None:
+    def prune(self, tracker: Tracker, own: Ownship) -> None:
         """End the tracks, among those to be confirmed, that a wall explains, and of the others
         those that are a nearer target's echoes over a wall frame after frame, or that went behind
         one. Targets that others report have such echoes too."""

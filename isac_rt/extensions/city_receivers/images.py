@@ -22,7 +22,7 @@ from isac_rt.kernels.jit import twin_of
 from isac_rt.kernels.track_images import EDGE, LEAST_RANGE
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import Ambiguity, measure, wrapped
-from isac_rt.track.parts import Own, TrackRule
+from isac_rt.track.parts import Ownship, TrackRule
 from isac_rt.world.mirrors import mirror_image
 from isac_rt.world.swarm import Pose
 
@@ -51,7 +51,7 @@ class Images(TrackRule):
         self._beam = resolutions(waveform, antennas, 1)[2:]
         self._cosine_period = antennas.cosine_period(waveform.wavelength, passes)
 
-    def candidates(self, detections: Detections, own: Own) -> Detections:
+    def candidates(self, detections: Detections, own: Ownship) -> Detections:
         d = detections
         spread = ALIAS_DEVIATIONS * d.std[:, 2:] if self._passes == 1 else 0.0
         inside = np.abs(d.direction) + spread < self._edge
@@ -61,7 +61,7 @@ class Images(TrackRule):
             starts[some] = ~self._beside_images(d.select(some), own)
         return replace(d, starts=starts)
 
-    def _beside_images(self, d: Detections, own: Own) -> np.ndarray:
+    def _beside_images(self, d: Detections, own: Ownship) -> np.ndarray:
         """(Q,) which detections lie within an image's main lobe: at a passive terminal in direction
         too, or in an alias of it."""
         reach = float(d.range.max()) + 1

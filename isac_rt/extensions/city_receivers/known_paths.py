@@ -17,7 +17,7 @@ from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.types import PathChannels, Reception
 from isac_rt.track.filter import Ambiguity, Gaussian, measure, wrapped
-from isac_rt.track.parts import Own
+from isac_rt.track.parts import Ownship
 from isac_rt.track.tracker import Track, Tracker, TrackSet
 from isac_rt.world.swarm import Pose
 
@@ -32,7 +32,7 @@ class LearnedHardware(SelfCalibration):
     """The terminal's estimate of its hardware, fed by the frames that it receives."""
 
     def learn_from(
-        self, reception: Reception, own: Own, tracker: Tracker, reference: Track | None
+        self, reception: Reception, own: Ownship, tracker: Tracker, reference: Track | None
     ) -> None:
         if self._passes == 2:
             tracks = tracker.snapshot(own.pose)

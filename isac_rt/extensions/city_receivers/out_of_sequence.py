@@ -23,7 +23,7 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.types import Detections, Hints, Prediction, Reception
 from isac_rt.track.filter import measure
-from isac_rt.track.parts import Late, OtherPaths, Own, delayed
+from isac_rt.track.parts import Late, OtherPaths, Ownship, delayed
 from isac_rt.track.reference import COAST_CELLS, Reference, end_symbols, slip_cells
 
 BATCH = 8
@@ -81,7 +81,7 @@ class OutOfSequence(OtherPaths):
         self,
         cube: IFCube,
         reception: Reception,
-        own: Own,
+        own: Ownship,
         reference: Reference,
         *,
         refused: bool,
@@ -110,7 +110,7 @@ class OutOfSequence(OtherPaths):
             return out, True
         return out.without_sight(self._is_named(own)), False
 
-    def _is_named(self, own: Own) -> bool:
+    def _is_named(self, own: Ownship) -> bool:
         """Return whether the path that is read over is as long, and changes as fast, as a path from
         the transmitter over the city's walls or about an edge."""
         path = self.state.path
@@ -154,7 +154,7 @@ class OutOfSequence(OtherPaths):
         if self.state.batch:
             self.state.path = self._learn(cube, time, False) or self.state.path
 
-    def take_over(self, reference: Prediction, own: Own) -> None:
+    def take_over(self, reference: Prediction, own: Ownship) -> None:
         p = delayed(reference, own.clock)
         mean = np.array([p.range[0], p.velocity[0], 0.0])
         spread = np.square([p.range_std[0], p.velocity_std[0], FIRST_ACCELERATION_STD])

@@ -19,7 +19,7 @@ from isac_rt.frame.antennas import Antennas, unit_vector
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import INITIAL_SPEED_STD, Ambiguity, mahalanobis
-from isac_rt.track.parts import Own, TrackRule
+from isac_rt.track.parts import Ownship, TrackRule
 from isac_rt.track.tracker import Track, Tracker, assign
 from isac_rt.world.swarm import Pose
 
@@ -46,7 +46,7 @@ STANDS_OUT = 10.0
 
 
 @dataclass
-class Seen:
+class StaticSpots:
     """Spots that were static lately: (n, 7) places, signal-to-noise ratios, times of the last echo,
     frames in which they were seen, and numbers of their first frame; and the frames so far."""
 
@@ -69,7 +69,7 @@ class StaticClutter(TrackRule):
     ) -> None:
         self._walls, self._period = walls, velocity_period
         self._crowd = np.zeros(0, bool)
-        self.state = Seen()
+        self.state = StaticSpots()
         by = [(0.0, -t, t) if np.isfinite(t) else (0.0,) for t in np.broadcast_to(cosine_period, 2)]
         self._aliases = np.array([(x, z) for x in by[0] for z in by[1]])
 
@@ -81,14 +81,14 @@ class StaticClutter(TrackRule):
         period = Ambiguity.of(waveform, passes).period
         return cls(antennas.cosine_period(waveform.wavelength, passes), walls, period)
 
-    def candidates(self, detections: Detections, own: Own) -> Detections:
+    def candidates(self, detections: Detections, own: Ownship) -> Detections:
         self._crowd = np.zeros(len(detections), bool)
         if own.clutter_known:  # else the city's own echoes are among them
             sender = None if own.transmitter is None else own.transmitter.mean[:6]
             self._crowd = self.update(detections, own.pose, own.time, sender)
         return replace(detections, starts=detections.starts & ~self._crowd)
 
-    def prune(self, tracker: Tracker, own: Own) -> None:
+    def prune(self, tracker: Tracker, own: Ownship) -> None:
         """End the tracks that are static within a crowd, and those, not confirmed before, that
         an echo of one carries on: from beyond the view and along a wall they seem
         to move."""

@@ -300,7 +300,7 @@ def _intersected(states: Sequence[Gaussian]) -> tuple[Gaussian, np.ndarray]:
     return fused, weights
 
 
-def together(
+def joint_states(
     uavs: Sequence[Sequence[Report]], itself: Mapping[int, tuple[str, Reported]]
 ) -> list[Gaussian]:
     r"""UAVs from their tracks, jointly with the errors of the terminals that tell of them.
@@ -341,8 +341,8 @@ def together(
 def _solved(
     num_uavs: int, num_errors: int, words: Sequence[tuple[int, list[int], Reported, float]]
 ) -> list[Gaussian]:
-    """The UAVs of `together`, whose information of each other is by way of the errors alone: the
-    errors first, then each UAV.
+    """The UAVs of `joint_states`, whose information of each other is by way of the errors alone:
+    the errors first, then each UAV.
 
     Parameters
     ----------
@@ -467,7 +467,7 @@ class FusedTracks(Stateful):
         itself = {k: (name, known[name]) for k, name in enumerate(whose) if name is not None}
         if self.uavs:
             members = [[by_key[k] for k in b.members] for b in self.uavs]
-            states = together(members, itself)
+            states = joint_states(members, itself)
         return [
             Fused(uav.name, in_datum(state), tuple(uav.members), terminal)
             for uav, state, terminal in zip(self.uavs, states, whose, strict=True)

@@ -46,7 +46,7 @@ HOLD_S = 0.5
 
 
 @dataclass(frozen=True)
-class Kept:
+class TrackNumbers:
     """The numbers of all tracks that a link's receiver kept at a time [s], and by whom they were
     said: "" by the terminal itself."""
 
@@ -79,7 +79,7 @@ class Message:
 
     sender: str
     terminals: Mapping[str, SelfReport]
-    kept: Mapping[str, Kept]
+    kept: Mapping[str, TrackNumbers]
     reports: Sequence[Report]
     left_out: int = 0
 
@@ -158,12 +158,12 @@ class Notes(Stateful):
 
     name: str
     reports: dict[Key, tuple[Report, str]] = field(default_factory=dict)
-    kept: dict[str, Kept] = field(default_factory=dict)
+    kept: dict[str, TrackNumbers] = field(default_factory=dict)
     terminals: dict[str, SelfReport] = field(default_factory=dict)
     reported_to: dict[str, dict[Key, float]] = field(default_factory=dict)
     fused_tracks: FusedTracks = field(default_factory=FusedTracks)
 
-    def see(self, origin: str, time: float, tracks: Mapping[int, Reported]) -> None:
+    def observe(self, origin: str, time: float, tracks: Mapping[int, Reported]) -> None:
         """Take down the tracks of one of its own links after a frame, by their numbers; tracks that
         were there before have begun before."""
         mine = [key for key in self.reports if key.origin == origin]
@@ -173,7 +173,7 @@ class Notes(Stateful):
             since = before[key].since if key in before else time
             name = before[key].name if key in before else Name(since, *key)
             self.reports[key] = Report(key, since, name, time, state, lever), ""
-        self.kept[origin] = Kept(time, tuple(tracks))
+        self.kept[origin] = TrackNumbers(time, tuple(tracks))
 
     def locate(self, time: float, state: Gaussian) -> None:
         """Take down where it is itself."""
@@ -194,7 +194,7 @@ class Notes(Stateful):
                 self.reports[report.key] = report, sender
 
     @staticmethod
-    def _newer(time: float, known: SelfReport | Kept | Report | None) -> bool:
+    def _newer(time: float, known: SelfReport | TrackNumbers | Report | None) -> bool:
         return known is None or time > known.time
 
     def fuse(self, time: float, acceleration_std: float) -> list[Fused]:

@@ -86,7 +86,7 @@ class Cooperation(Stateful):
         for name, notes in self._notes.items():
             notes.locate(time, of_itself(poses[name]))
         for link, result in received.items():
-            self._see(frame, link, result)
+            self._observe(frame, link, result)
         views = {
             name: View(
                 time,
@@ -96,7 +96,7 @@ class Cooperation(Stateful):
             )
             for name, notes in self._notes.items()
         }
-        together = self._together(frame, time, poses)
+        swarm_view = self._all_together(frame, time, poses)
         self.state.known = {
             k: v for k, v in self.state.known.items() if k > frame - PREFETCHED_FRAMES
         }
@@ -105,7 +105,7 @@ class Cooperation(Stateful):
             {n: self._reported_uavs(n, views[n], time) for n in self._notes},
         )
         self._send(frame)
-        return {**views, SWARM: View(time, tuple(together))}
+        return {**views, SWARM: View(time, tuple(swarm_view))}
 
     def _reported_uavs(self, name: str, view: View, time: float) -> list[ReportedUav]:
         """Return the targets that a terminal knows of: other terminals by their reports, and the
@@ -126,7 +126,7 @@ class Cooperation(Stateful):
             if uav.terminal not in link
         ]
 
-    def _together(self, frame: int, time: float, poses: Mapping[str, Pose]) -> list[Fused]:
+    def _all_together(self, frame: int, time: float, poses: Mapping[str, Pose]) -> list[Fused]:
         """Return what all terminals know together at a time [s], without what is `_refuted`."""
         known = {name: of_itself(poses[name]) for name in self._notes}
         own = [
@@ -172,7 +172,7 @@ class Cooperation(Stateful):
         snr = (amplitude * antennas.element_gain(towards)) ** 2 * sees.cell
         return sees.clutter_free(float(snr)) > 0.5
 
-    def _see(self, frame: int, link: Link, received: LinkResult) -> None:
+    def _observe(self, frame: int, link: Link, received: LinkResult) -> None:
         """A terminal takes down the confirmed tracks of one of its links."""
         setup, tracks = self._setup, received.tracks
         time = setup.timetable.epoch(frame, link.tx)
@@ -183,7 +183,7 @@ class Cooperation(Stateful):
         confirmed = (tracks.confirmed & ~tracks.is_reference).nonzero()[0]
         cell = setup.waveform.range_cell(1)
         states = {int(tracks.ids[k]): in_world(tracks, int(k), own, clock, cell) for k in confirmed}
-        self._notes[link.rx].see(str(link), time, states)
+        self._notes[link.rx].observe(str(link), time, states)
 
     def _capacities(self, frame: int) -> dict[Link, int]:
         """Bits that each way from terminal to terminal has for messages in a frame: an active

@@ -274,8 +274,8 @@ def _peaks(y: np.ndarray, cell: float) -> np.ndarray:
     for _ in range(ROUNDS):  # Newton on the periodogram
         e = still * np.exp(found[..., None] * exponent)
         s, d, dd = e.sum(axis=-1), e @ exponent, e @ exponent**2
-        bend = np.abs(d) ** 2 + (s.conj() * dd).real
-        step = (s.conj() * d).real / np.where(bend < 0, bend, -(np.abs(d) ** 2) - 1e-300)
+        curvature = np.abs(d) ** 2 + (s.conj() * dd).real
+        step = (s.conj() * d).real / np.where(curvature < 0, curvature, -(np.abs(d) ** 2) - 1e-300)
         found = found - np.clip(step, -0.1, 0.1)
     return np.asarray(cell + found)
 

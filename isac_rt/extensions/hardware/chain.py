@@ -173,8 +173,8 @@ def _read(own: np.ndarray, row: int, work: Work) -> np.ndarray:
         return np.sum(read, axis=0).astype(np.complex64)
     assert work.taps is not None and work.shift is not None
     slope = sum(work.taps[t, 0] * (beside(t) - beside(-t)) for t in range(1, len(work.taps)))
-    bend = work.taps[0, 1] * beside(0) + work.taps[1, 1] * (beside(1) + beside(-1))
-    return np.asarray(beside(0) + work.shift * (slope + work.shift * bend), np.complex64)
+    curvature = work.taps[0, 1] * beside(0) + work.taps[1, 1] * (beside(1) + beside(-1))
+    return np.asarray(beside(0) + work.shift * (slope + work.shift * curvature), np.complex64)
 
 
 def _converted(own: np.ndarray, work: Work) -> np.ndarray:

@@ -31,7 +31,7 @@ from isac_rt.extensions.two_bounces.mirrors import Mirror, shown, strongest
 from isac_rt.frame.antennas import Arrays
 from isac_rt.propagation.clutter.field import (
     ClutterField,
-    Seen,
+    Visible,
     motion_to,
     scattered_power,
 )
@@ -47,13 +47,13 @@ CACHED_SAMPLES = 16
 """Time samples per terminal whose tests are remembered; a frame needs six."""
 
 
-_Visibility = tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]
+_Share = tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]
 """How far (N,) scatterers are in sight of an end, and of each of its mirrors which show in it and
 how far."""
 
 
 @dataclass(frozen=True)
-class SeenByMirror:
+class Mirrored:
     """K scatterers between two terminals by way of one mirror.
 
     Attributes
@@ -64,7 +64,7 @@ class SeenByMirror:
     before : whether the mirror comes before the scatterer
     """
 
-    seen: Seen
+    seen: Visible
     phasor: np.ndarray
     mirror: Mirror
     before: bool
@@ -109,7 +109,7 @@ class TwoBounces:
             for name, kept in self.mirrors.items()
         }
 
-    def seen(self, state: LinkState, discs: UavDiscs | None = None) -> list[SeenByMirror]:
+    def seen(self, state: LinkState, discs: UavDiscs | None = None) -> list[Mirrored]:
         """Return the scatterers in sight of both ends, once for each mirror and order; poses in
         local coordinates."""
         direct, time = self._field.visibility, state.epoch
@@ -123,7 +123,7 @@ class TwoBounces:
                 self._shade(found, state, discs)
         return out
 
-    def from_places(self, state: LinkState) -> list[SeenByMirror]:
+    def from_places(self, state: LinkState) -> list[Mirrored]:
         """The same by rays alone, wherever the ends are."""
         positions = np.array([state.start.position, state.end.position])
         tx, rx = (
@@ -134,7 +134,7 @@ class TwoBounces:
         )
         return self._between(state, tx, rx)
 
-    def _between(self, state: LinkState, tx: _Visibility, rx: _Visibility) -> list[SeenByMirror]:
+    def _between(self, state: LinkState, tx: _Share, rx: _Share) -> list[Mirrored]:
         """Ways by the mirrors of the one end, then by those of the other."""
         out = []
         for before, name, shown_in, straight in (
@@ -164,7 +164,7 @@ class TwoBounces:
             )
         return out
 
-    def _chain(self, part: SeenByMirror, state: LinkState) -> tuple[np.ndarray, np.ndarray]:
+    def _chain(self, part: Mirrored, state: LinkState) -> tuple[np.ndarray, np.ndarray]:
         """Points (K, 2, 3) and faces (K, 2) in the order in which the wave meets them; all faces of
         a mirror go by its largest."""
         points = self._field.cells.points[part.seen.index]
@@ -221,7 +221,7 @@ class TwoBounces:
 
     def _over_mirror(
         self, mirror: Mirror, index: np.ndarray, share: np.ndarray, state: LinkState, before: bool
-    ) -> SeenByMirror:
+    ) -> Mirrored:
         start, end = state.start.motion(), state.end.motion()
         if before:
             start = mirror.image(state.start)
@@ -236,15 +236,15 @@ class TwoBounces:
         else:
             arrival = mirror_image(arrival, mirror.normal)
         ends = there[0], back[0], departure, arrival
-        seen = Seen(length, rate, accel.astype(np.float32), *ends, index, share)
+        seen = Visible(length, rate, accel.astype(np.float32), *ends, index, share)
         gain = share * self._gain(mirror, seen, before)
         size = np.abs(gain)
         some = np.flatnonzero(size > 0)
         phasor = (gain[some] / size[some]).astype(np.complex64)
         seen = replace(seen, magnitude=size.astype(np.float32))
-        return SeenByMirror(Seen(*(a[some] for a in vars(seen).values())), phasor, mirror, before)
+        return Mirrored(Visible(*(a[some] for a in vars(seen).values())), phasor, mirror, before)
 
-    def _gain(self, mirror: Mirror, seen: Seen, before: bool) -> np.ndarray:
+    def _gain(self, mirror: Mirror, seen: Visible, before: bool) -> np.ndarray:
         """Complex gains (K,) of ways over scatterers that nothing hides; their own amplitudes are
         left out.
 
@@ -274,7 +274,7 @@ class TwoBounces:
         scale = self._wavelength / (4 * np.pi)
         return scale * passed * np.sqrt(power) / (seen.tx_radius * seen.rx_radius)
 
-    def _shade(self, part: SeenByMirror, state: LinkState, discs: UavDiscs) -> None:
+    def _shade(self, part: Mirrored, state: LinkState, discs: UavDiscs) -> None:
         """Put it into the shadows of the swarm's UAVs, on both ways."""
         points, _ = self._chain(part, state)
         split = 2 if part.before else 1

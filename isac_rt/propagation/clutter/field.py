@@ -60,7 +60,7 @@ from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
 from isac_rt.propagation.segments.discs import UavDiscs
 from isac_rt.propagation.segments.rays import LosTest
 from isac_rt.propagation.segments.reflection import slab_coefficients
-from isac_rt.storage import kept
+from isac_rt.storage import cached
 from isac_rt.world.city.materials import Material
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
@@ -95,7 +95,7 @@ class Surfaces(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Seen(ScatterPaths):
+class Visible(ScatterPaths):
     """K scatterers of the field between two terminals at one instant, isotropic antennas.
 
     Magnitude and acceleration are float32. On a monostatic link both ends share arrays.
@@ -117,7 +117,7 @@ class Seen(ScatterPaths):
 
 
 class Rows(NamedTuple):
-    """Arrays of `Seen`, in its order, for the kernels."""
+    """Arrays of `Visible`, in its order, for the kernels."""
 
     length: np.ndarray
     rate: np.ndarray
@@ -282,7 +282,7 @@ class ClutterField:
             return {"cells": vars(cells.select(~twice)), "of": of, "overlap": again}
 
         depends_on = [plain(city), positions, lookouts, fronts, asdict(density), seed, MOST_CELLS]
-        had = kept("cells", [*depends_on, mi.variant()], found)
+        had = cached("cells", [*depends_on, mi.variant()], found)
         cells = Cells(**had["cells"])
         visibility = Visibility(los, flights, facets_of(cells, city), wavelength, city)
         field = cls(city, cells, visibility, wavelength, had["of"], had["overlap"])
@@ -294,7 +294,7 @@ class ClutterField:
         }
         states = [[(*p.motion(), *p.rotation) for p in some] for some in poses.values()]
         depends_on += [vars(cells), wavelength, floor.record(), list(poses), np.array(states)]
-        merged = kept(
+        merged = cached(
             "merged",
             [*depends_on, mi.variant()],
             lambda: field._below_noise(floor, poses, density, positions),
@@ -380,7 +380,7 @@ class ClutterField:
             visibility.nbytes for _, visibility in every
         )
 
-    def seen(self, state: LinkState, discs: UavDiscs | None = None) -> Seen:
+    def seen(self, state: LinkState, discs: UavDiscs | None = None) -> Visible:
         """Return the scatterers visible from both ends of a link, poses in local coordinates, with
         the shadows of `discs`."""
         (tx, rx), own, start, end = state.link, state.link.own, state.start, state.end
@@ -403,22 +403,22 @@ class ClutterField:
         if lit.size == found.magnitude.size:
             return found
         parts = {id(a): a.take(lit, axis=0) for a in vars(found).values()}
-        return Seen(*(parts[id(a)] for a in vars(found).values()))
+        return Visible(*(parts[id(a)] for a in vars(found).values()))
 
-    def from_places(self, state: LinkState) -> Seen:
+    def from_places(self, state: LinkState) -> Visible:
         """Return the scatterers visible from both ends by rays alone, on or off the planned
         flights; poses in local coordinates."""
         ends = np.array([state.start.position, state.end.position])
         one, other = self.visibility.from_places(ends)
         return self._paths_over(self.cells, (one & other).astype(np.float32), state)
 
-    def _paths_over(self, cells: Cells, share: np.ndarray, state: LinkState) -> Seen:
+    def _paths_over(self, cells: Cells, share: np.ndarray, state: LinkState) -> Visible:
         """Return the paths over cells with a visibility `share` (N,) other than 0."""
         own, start, end = state.link.own, state.start, state.end
         index = np.flatnonzero(share).astype(np.int32)
         count = index.size
         radius, departure = np.empty(count), np.empty((count, 3))
-        found = Seen(
+        found = Visible(
             length=np.empty(count),
             rate=np.empty(count),
             accel=np.empty(count, np.float32),

@@ -20,7 +20,7 @@ from scipy.interpolate import BSpline
 from isac_rt.propagation.clutter.penumbra import REACH as PENUMBRA
 from isac_rt.propagation.clutter.penumbra import Crossings, Facets, crossings, penumbra
 from isac_rt.propagation.segments.rays import LosTest
-from isac_rt.storage import checksum, kept, pack
+from isac_rt.storage import cached, checksum, pack
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Trajectory
 
@@ -261,7 +261,7 @@ class Visibility:
                 return {"seen": np.packbits(seen, axis=1), "crossed": [vars(c) for c in crossed]}
 
             self._content = self._content or checksum(*pack(self._depends_on))
-            of = kept("sight", [self._content, time_samples], found)
+            of = cached("sight", [self._content, time_samples], found)
             crossed = [Crossings(**c) for c in of["crossed"]]
             self._stretches[name, number] = _Stretch(of["seen"], crossed)
         return self._stretches[name, number]

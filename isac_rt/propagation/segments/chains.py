@@ -25,7 +25,7 @@ import numpy as np
 from isac_rt.propagation.clutter.visibility import Flight
 from isac_rt.propagation.segments.geometry import RAY_OFFSET_M
 from isac_rt.propagation.segments.rays import rays
-from isac_rt.storage import checksum, kept, pack
+from isac_rt.storage import cached, checksum, pack
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.city.scene import CityScenes
 from isac_rt.world.mirrors import mirror_image
@@ -129,7 +129,7 @@ class Search:
             mesh = [city.vertices, city.faces, city.plane_of_face]
             self._mesh = self._mesh or checksum(*pack(mesh))
             search = [positions, [*near], self._num_rays, self._depth, mi.variant()]
-            for n, tree in zip(near, kept("chains", [self._mesh, *search], found), strict=True):
+            for n, tree in zip(near, cached("chains", [self._mesh, *search], found), strict=True):
                 self._kept[name, n] = Chains(*tree)
         return self._kept[name, number]
 

@@ -83,11 +83,11 @@ def direct_segments(
     starts, ends = (
         np.array([poses[pair[k]].position for pair in separated]).reshape(-1, 3) for k in (0, 1)
     )
-    bends = edges.bends(starts, ends)
-    factors = edge_factor(bends.nu)
+    diffractions = edges.diffractions(starts, ends)
+    factors = edge_factor(diffractions.nu)
     spared, there = discs.spared(separated), factors != 0
-    straight_on, round_edge = there & (bends.nu <= 0), there & (bends.nu > 0)
-    for which, *between in ((straight_on,), (round_edge, bends.points)):
+    straight_on, round_edge = there & (diffractions.nu <= 0), there & (diffractions.nu > 0)
+    for which, *between in ((straight_on,), (round_edge, diffractions.points)):
         stops = np.stack([stop[which] for stop in (starts, *between, ends)], axis=1)
         factors[which] *= discs.factor(stops, wavelength, spared[which])
     out = {}
@@ -96,7 +96,7 @@ def direct_segments(
         direct = straight(start, end.position[None], end.velocity, end.acceleration)
         segment, factor = replace(direct, points=np.full((1, 1, 3), np.nan)), factors[k]
         if round_edge[k]:
-            segment = _bent(start, end, bends.points[k])
+            segment = _diffracted(start, end, diffractions.points[k])
             # the detour's phase is in its delay
             factor = factor * np.exp(2j * np.pi * (segment.length - direct.length) / wavelength)
         friis = wavelength / (4 * np.pi * direct.length)
@@ -104,7 +104,7 @@ def direct_segments(
     return out
 
 
-def _bent(start: Pose, end: Pose, point: np.ndarray) -> Segments:
+def _diffracted(start: Pose, end: Pose, point: np.ndarray) -> Segments:
     """The segment by way of a point at rest. Where the detour is the shortest over an edge, its
     rate is that of the detour as it moves too."""
     there, on = straight(start, point[None]), straight(end, point[None])

@@ -89,7 +89,7 @@ class Edges(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Bends:
+class Diffractions:
     """The edge that matters to each of K straight paths.
 
     Attributes
@@ -109,13 +109,13 @@ class ShadowEdges:
     def __init__(self, city: CityMesh, los: LosTest, wavelength: float) -> None:
         self._edges, self._los, self._wavelength = Edges.of(city), los, wavelength
 
-    def bends(self, starts: np.ndarray, ends: np.ndarray) -> Bends:
+    def diffractions(self, starts: np.ndarray, ends: np.ndarray) -> Diffractions:
         """For paths (K, 3) to (K, 3), neither end nearer to a surface than `BESIDE`. Local
         coordinates."""
         count = len(starts)
         nu, points = np.full(count, -np.inf), np.full((count, 3), np.nan)
         if not count or not len(self._edges.start):
-            return Bends(nu, points)
+            return Diffractions(nu, points)
         lit = self._los.clear(starts, ends)
         nu[~lit] = np.inf
         reach = np.where(lit, LIT_REACH, SHADOW_REACH) ** 2 / 4 * self._wavelength
@@ -123,7 +123,7 @@ class ShadowEdges:
         found = [near(edges, s, e, far) for s, e, far in zip(starts, ends, reach, strict=True)]
         path = np.repeat(np.arange(count), [len(f[0]) for f in found])
         if not path.size:
-            return Bends(nu, points)
+            return Diffractions(nu, points)
         detour, at, out = (np.concatenate(part) for part in zip(*found, strict=True))
         ahead = (ends - starts)[path]
         ahead *= BESIDE / np.linalg.norm(ahead, axis=1, keepdims=True)
@@ -140,7 +140,7 @@ class ShadowEdges:
         size = 2 * np.sqrt(np.maximum(detour[true[first]], 0.0) / self._wavelength)
         nu[which] = np.where(lit[which], -size, size)
         points[which] = at[true[first]]
-        return Bends(nu, points)
+        return Diffractions(nu, points)
 
 
 @twin_of(propagation_edges.near)

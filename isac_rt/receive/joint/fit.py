@@ -101,13 +101,13 @@ def fit(
     """
     state = _Descent(moments, paths, fixed, moments.energy if energy is None else energy)
     state.amplitudes()
-    awake = np.full(len(paths), True)
+    pending = np.full(len(paths), True)
     for _ in range(iterations):
         group = state.group
-        awake = np.isin(group, group[awake])
-        if not awake.any():
+        pending = np.isin(group, group[pending])
+        if not pending.any():
             break
-        awake = state.step(np.flatnonzero(awake))
+        pending = state.step(np.flatnonzero(pending))
     return state.fit()
 
 
@@ -139,14 +139,14 @@ class _Descent:
         sums = np.array([p.amplitude * self.samples for p in fixed]).reshape(-1, self.count)
         sums = np.concatenate([self._by_amplitude(self.seen[:, 0, 0]), sums])
         self.power = (np.abs(sums) ** 2 / self.samples).sum(axis=1)
-        self.felt = self._felt(moments.noise)
+        self.coupled = self._coupled(moments.noise)
         self.size = PARAMETERS + 2 * self.count
         self.explained = np.zeros(self.free)
         self.deviation = np.full((self.free, self.size), np.inf)
         self.stirred, self.stale = np.zeros(self.free), np.zeros(self.free, bool)
         self.last, self.reach = np.zeros((self.free, PARAMETERS)), np.ones(self.free)
 
-    def _felt(self, noise: float) -> np.ndarray:
+    def _coupled(self, noise: float) -> np.ndarray:
         """(free, K) bool, which other paths count in the sums of each free one."""
         out = ~ignored(self.share, self.power / noise) | (self.share > CLOSE)
         out[:, : self.free] |= out[:, : self.free].T
@@ -170,7 +170,7 @@ class _Descent:
 
     def amplitudes(self) -> None:
         """Give the free paths the amplitudes of least squares where they are."""
-        of, at = np.nonzero(self.felt)
+        of, at = np.nonzero(self.coupled)
         kept = (at < of) | (at >= self.free)
         of, at = of[kept], at[kept]
         alone = self.weights._replace(factors=self.weights.factors[:1])
@@ -193,7 +193,7 @@ class _Descent:
         gradient, gram = self._equations(active)
         noise, moved = self.noise, np.zeros(self.free)
         self.power = np.array([(np.abs(p.amplitude) ** 2 @ self.samples) for p in self.paths])
-        self.felt = self._felt(max(noise, self.moments.noise))
+        self.coupled = self._coupled(max(noise, self.moments.noise))
         for g in np.unique(self.group[active]):
             mine = np.flatnonzero(self.group == g)
             cells = (mine[:, None] * self.size + np.arange(self.size)).ravel()
@@ -205,7 +205,9 @@ class _Descent:
             share = self._within_reach(mine, steps[:, :PARAMETERS] / LARGEST_STEP)
             self._move(mine, share * steps)
         self.stirred[active] = 0
-        self.stirred += TANGENTS * (self.share[:, : self.free] * self.felt[:, : self.free]) @ moved
+        self.stirred += (
+            TANGENTS * (self.share[:, : self.free] * self.coupled[:, : self.free]) @ moved
+        )
         return (moved > SETTLED) | (self.stirred > MAX_DRIFT)
 
     def _within_reach(self, mine: np.ndarray, steps: np.ndarray) -> float:
@@ -260,7 +262,7 @@ class _Descent:
     def _pairs(self, active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Active paths with each one that they feel, (Q, 2), each pair of free ones once: those of
         a cluster, and the others."""
-        of, at = np.nonzero(self.felt)
+        of, at = np.nonzero(self.coupled)
         acts = np.isin(np.arange(len(self.paths)), active)
         kept = acts[of] & ((at < of) | ~acts[at])
         of, at = of[kept], at[kept]

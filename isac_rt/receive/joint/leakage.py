@@ -118,8 +118,10 @@ def _fit(known: Known, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         slant = (back[..., :-1] * sums[..., 1:]).sum(axis=-1)
         amplitude = zeroth / count
         slope = (amplitude.conj() * (slant - amplitude * first)).imag
-        bend = np.abs(amplitude) ** 2 * (second - first**2 / count)
-        phi = np.clip(phi + slope / np.maximum(bend, 1e-300), -2 * np.pi * STEP, 2 * np.pi * STEP)
+        curvature = np.abs(amplitude) ** 2 * (second - first**2 / count)
+        phi = np.clip(
+            phi + slope / np.maximum(curvature, 1e-300), -2 * np.pi * STEP, 2 * np.pi * STEP
+        )
     return (_series(-phi)[..., :-1] * sums[..., :-1]).sum(axis=-1) / count, phi
 
 

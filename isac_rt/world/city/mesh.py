@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from isac_rt.kernels import world_mesh
 from isac_rt.kernels.jit import twin_of
-from isac_rt.storage import kept
+from isac_rt.storage import cached
 from isac_rt.world.city.georeference import GeoReference
 from isac_rt.world.city.heights import HIGHEST_M
 from isac_rt.world.city.materials import CityError, Material, MaterialUse
@@ -154,7 +154,7 @@ class CityMesh:
         if self.num_faces < MIN_CACHED_FACES:
             return _read_only(self._planes())
         depends_on = [self.vertices, self.faces, self.plane_tolerance]
-        return _read_only(kept("planes", depends_on, self._planes))
+        return _read_only(cached("planes", depends_on, self._planes))
 
     def _planes(self) -> NDArray[np.int64]:
         _LOG.info("finding the planes of %s faces", f"{self.num_faces:,}")

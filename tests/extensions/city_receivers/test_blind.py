@@ -11,8 +11,8 @@ from receiver_cubes import ANTENNAS, C, Path, cube, frame
 
 from isac_rt.extensions.city_receivers.blind import (
     Peaks,
+    _Chirps,
     _comb,
-    _Seen,
     acquire,
     find_peaks,
     read_peaks,
@@ -134,7 +134,7 @@ def test_whole_cells_from_frame_to_frame_are_no_rate():
             place = 141.3 + rate * t + curvature * np.minimum(t + 0.1, 0.0) ** 2 / 2
             symbols = rng.integers(0, 512, time.size)
             noise = 0.013 * rng.standard_normal(time.size)
-            seen.append(_Seen(True, middle, time, place + symbols + noise))
+            seen.append(_Chirps(True, middle, time, place + symbols + noise))
         found = _comb(seen, w)
         wrong += found is not None and abs(found[0][1] - rate) > 0.25 / 0.045
     assert wrong == 0

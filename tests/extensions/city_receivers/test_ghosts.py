@@ -15,7 +15,7 @@ from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.track.filter import Ambiguity, Gaussian
-from isac_rt.track.parts import Own, ReportedUav
+from isac_rt.track.parts import Ownship, ReportedUav
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import Track, Tracker, track_set
 from isac_rt.world.city.mesh import CityMesh
@@ -201,7 +201,7 @@ def test_a_confirmed_echo_ends_once_its_body_is_known_three_frames():
         ghosts = Ghosts(Walls(wall()), leeway)
         for known in reported:
             assert len(tracker.tracks) == 1
-            ghosts.prune(tracker, Own(OWN, 0.0, reports=[ReportedUav("", b) for b in known]))
+            ghosts.prune(tracker, Ownship(OWN, 0.0, reports=[ReportedUav("", b) for b in known]))
         assert len(tracker.tracks) == left
 
 
@@ -224,7 +224,7 @@ def test_a_confirmed_track_that_goes_behind_a_wall_ends(depth, std, frames):
     tracker.state.tracks = [one]
     ended = None
     for frame in range(1, 5):
-        ghosts.prune(tracker, Own(OWN, 0.0))
+        ghosts.prune(tracker, Ownship(OWN, 0.0))
         ended = frame if ended is None and not tracker.tracks else ended
     assert ended == frames
 

@@ -19,7 +19,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import Ambiguity, Gaussian
-from isac_rt.track.parts import Own
+from isac_rt.track.parts import Ownship
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import Track, Tracker
 from isac_rt.world.city.mesh import CityMesh
@@ -210,7 +210,7 @@ def test_images_and_aliases_start_no_track():
             [-0.6, -0.6 + period, -0.6, 1.2, 3.0],
             [0.2, 0.2, 0.2, 0.2, 0.85],
         ),
-        Own(OWN, 0.0),
+        Ownship(OWN, 0.0),
     )
     assert found.starts.tolist() == [False, False, True, True, False]
 
@@ -228,7 +228,7 @@ def test_images_of_the_transmitter_start_no_track_where_they_stand():
         [z[2], z[2], z[2], z[2] - 0.5],
     )
     d = replace(d, direction=np.column_stack([d.direction[:, 0], np.full(4, z[3])]))
-    found = Images(city(WALL), ANTENNAS, W, 1).candidates(d, Own(own, 0.0, reference=known))
+    found = Images(city(WALL), ANTENNAS, W, 1).candidates(d, Ownship(own, 0.0, reference=known))
     assert found.starts.tolist() == [False, True, True, True]
 
 
@@ -247,7 +247,7 @@ def test_an_image_beyond_the_view_starts_no_track_in_its_alias():
     known = Track.of_state(Gaussian(sender, 1e-4 * np.eye(6)))
     d = detections([z[0], z[0]], [z[1], z[1]], [z[2] - 1 / 0.5774, z[2] - 0.5 / 0.5774])
     d = replace(d, direction=np.column_stack([d.direction[:, 0], np.full(2, z[3])]))
-    found = Images(city(WALL), ANTENNAS, W, 1).candidates(d, Own(own, 0.0, reference=known))
+    found = Images(city(WALL), ANTENNAS, W, 1).candidates(d, Ownship(own, 0.0, reference=known))
     assert found.starts.tolist() == [False, True]
 
 

@@ -10,7 +10,7 @@ from isac_rt.extensions.city_receivers.static_clutter import MEMORY_S, StaticClu
 from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import UNAMBIGUOUS, Gaussian
-from isac_rt.track.parts import Own
+from isac_rt.track.parts import Ownship
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import Track, Tracker
 from isac_rt.world.city.mesh import CityMesh
@@ -217,7 +217,7 @@ def test_a_young_track_that_an_echo_of_a_crowd_carries_on_is_none():
     tracker.state.tracks = tracks
     static_clutter = StaticClutter(1.71, None, PERIOD)
     static_clutter._crowd = np.array([True, False])
-    static_clutter.prune(tracker, Own(own(0.0), 0.0, tentative=frozenset({1, 3, 4, 5})))
+    static_clutter.prune(tracker, Ownship(own(0.0), 0.0, tentative=frozenset({1, 3, 4, 5})))
     assert [t.id for t in tracker.tracks] == [2, 3, 5]
 
 

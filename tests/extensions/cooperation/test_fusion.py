@@ -27,8 +27,8 @@ from isac_rt.extensions.cooperation.fusion import (
     in_world,
     intersection,
     intersection_of,
+    joint_states,
     report_of,
-    together,
 )
 from isac_rt.track.filter import Gaussian, bistatic_distance, predict
 from isac_rt.track.fused import Key, Name
@@ -429,7 +429,7 @@ def test_what_one_body_shows_of_a_terminal_helps_the_others():
     mean, other = rng.normal(size=6), rng.normal(size=6)
     one, two = levered(("A->A", 1), mean, P1, rng), levered(("A->A", 2), other, P2, rng)
     itself = of_itself(Pose(mean[:3] + 0.2, mean[3:] - 0.1, np.zeros(3), np.eye(3)))
-    found = together([[one], [two]], {0: ("T", report_of(itself))})
+    found = joint_states([[one], [two]], {0: ("T", report_of(itself))})
     L1, L2 = one.lever, two.lever
     S = L1 @ L1.T + P1 + itself.covariance + OWN_NOISE**2 * np.eye(6)
     C = np.eye(ERRORS) - L1.T @ np.linalg.solve(S, L1)
@@ -465,7 +465,7 @@ def test_a_picture_is_the_solution_of_its_normal_equations(seed):
         name: report_of(Gaussian(rng.normal(size=6), np.eye(6))).after(0.3, 2.0)
         for name in ("B", "T")
     }
-    found = together(uavs, {1: ("B", words["B"]), 4: ("T", words["T"])})
+    found = joint_states(uavs, {1: ("B", words["B"]), 4: ("T", words["T"])})
 
     unknown = [("body", k, i) for k in range(len(uavs)) for i in range(6)]
     unknown += [("pose", name, i) for name in "ABT" for i in range(ERRORS - 1)]
@@ -518,7 +518,7 @@ def test_a_word_of_some_time_ago_has_the_errors_of_then_carried_on(acceleration)
     )
     itself = Gaussian(0.1 * rng.normal(size=6), D**2)
     word = report_of(itself).after(age, acceleration)
-    found = together([[of_t], [of_stranger]], {0: ("T", word)})
+    found = joint_states([[of_t], [of_stranger]], {0: ("T", word)})
 
     carry = np.kron([[1, age], [0, 1]], np.eye(3))
     rest = advance(Gaussian(np.zeros(6), OWN_NOISE**2 * np.eye(6)), age, acceleration).covariance
@@ -562,7 +562,7 @@ def test_errors_of_terminals_are_told_apart_whatever_else_is_common(seed):
                     for t, origin in enumerate(keys)
                 ]
             )
-        return together(uavs, {})
+        return joint_states(uavs, {})
 
     nothing = np.zeros((2, 3, 6))
     stated = estimate(nothing)

@@ -29,7 +29,7 @@ def state(x=30.0, variance=0.01):
 
 def seen(notes, time, *numbers, origin="A->A", variance=0.01):
     lever = np.zeros((6, ERRORS))
-    notes.see(origin, time, {n: Reported(state(30 + 5 * n, variance), lever) for n in numbers})
+    notes.observe(origin, time, {n: Reported(state(30 + 5 * n, variance), lever) for n in numbers})
     notes.locate(time, state(0.0))
     return notes
 
@@ -141,7 +141,7 @@ def test_words_that_come_back_make_nothing_surer():
     for frame in range(20):
         seen(a, T * frame, 1, variance=0.04)
         for notes, origin in ((b, "A->B"), (c, "A->C")):
-            notes.see(origin, T * frame, {})
+            notes.observe(origin, T * frame, {})
             notes.locate(T * frame, state(-50.0))
         words = {
             (x.name, y.name): x.compose(y.name, 10**4) for x, y in ((a, b), (b, a), (b, c), (c, b))
