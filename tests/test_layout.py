@@ -243,7 +243,7 @@ MAX_LINES = {
     "signal": 820,
     "receive": 6065,
     "track": 1926,
-    "scenario": 1835,
+    "scenario": 1836,
     "results": 3695,
     "simulation": 3430,
     "sweep": 2790,

@@ -170,8 +170,9 @@ def _places(path: Path) -> dict[str, Any]:
     return {"positions": [list(row) for row in rows]}
 
 
-def _flight(city: Any, folder: Path, path: Path) -> dict[str, Any]:
-    """Waypoints of a flight, from a log or a table."""
+def _flight(city: Any, folder: Path, directed: bool, path: Path) -> dict[str, Any]:
+    """Waypoints of a flight, from a log or a table. `directed`: a stated boresight stands in place
+    of a log's attitudes."""
     log = extension("flight_log")(path)
     if log is None:
         return _flight_table(city, folder, path)
@@ -182,7 +183,11 @@ def _flight(city: Any, folder: Path, path: Path) -> dict[str, Any]:
     if log.without_height:
         positions[:, 2] = 0.0
     rows = zip(log.times.tolist(), positions.tolist(), strict=True)
-    return {"waypoints": [{"time_s": time, "position_m": position} for time, position in rows]}
+    out = [{"time_s": time, "position_m": position} for time, position in rows]
+    if log.attitudes is not None and not directed:
+        for point, angles in zip(out, log.attitudes.tolist(), strict=True):
+            point["attitude_deg"] = angles
+    return {"waypoints": out}
 
 
 def _flight_table(city: Any, folder: Path, path: Path) -> dict[str, Any]:
@@ -284,7 +289,9 @@ def _tables_of(tree: dict[str, Any], folder: Path) -> Iterator[tuple[Key, str, R
         yield (*owner, "array", "rx"), "file", _places
         yield (*owner, "array"), "pattern_file", _pattern
     for _, name in uavs:
-        yield ("swarm", name), "flight", partial(_flight, tree.get("city"), folder)
+        uav = _at(tree, ("swarm", name))
+        directed = isinstance(uav, dict) and uav.get("boresight", "velocity") != "velocity"
+        yield ("swarm", name), "flight", partial(_flight, tree.get("city"), folder, directed)
         yield ("swarm", name, "rcs"), "file", by_aspect("dbsm")
 
 

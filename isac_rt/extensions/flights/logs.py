@@ -12,12 +12,14 @@ from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 from isac_rt.runtime import needed, shortly
 from isac_rt.scenario.tables import MAX_WAYPOINTS, number
 
 KEPT_BEFORE_S = 1.0
 """Part of a log that is kept before the run's start, for the spline's slope there [s]."""
+_ATTITUDE = "vehicle_attitude"
 _LOCAL, _GLOBAL = "vehicle_local_position", "vehicle_global_position"
 _VALID = ("xy_valid", "z_valid", "lat_lon_valid", "alt_valid")
 _FIX, _ODOMETRY = "sensor_msgs/msg/NavSatFix", "nav_msgs/msg/Odometry"
@@ -27,13 +29,15 @@ _TYPES = (_ODOMETRY, "geometry_msgs/msg/PoseStamped", _FIX)
 @dataclass(frozen=True)
 class FlightLog:
     """Times (N,) [s] and positions (N, 3) of one UAV or object: east, north, up [m], or latitude,
-    longitude [degrees] and height [m]. `note` says what was taken."""
+    longitude [degrees] and height [m]. `note` says what was taken. `attitudes` (N, 3): yaw, pitch
+    and roll [degrees], None where the log states none."""
 
     note: str
     times: NDArray[np.float64]
     positions: NDArray[np.float64]
     in_degrees: bool
     without_height: bool = False
+    attitudes: NDArray[np.float64] | None = None
 
 
 def flight_log(path: Path) -> FlightLog | None:
@@ -69,7 +73,11 @@ def _thinned(log: FlightLog, file: str) -> FlightLog:
     note = f"{file}: {log.note}, {held.size} positions, {np.ptp(log.times[held]):.1f} s"
     note += f", one of {step} is taken" if step > 1 else ""
     held = held[::step]
-    return replace(log, note=note, times=log.times[held], positions=log.positions[held])
+    attitudes = log.attitudes
+    if attitudes is not None:
+        note, attitudes = f"{note}, with attitudes", attitudes[held]
+    times, positions = log.times[held], log.positions[held]
+    return replace(log, note=note, times=times, positions=positions, attitudes=attitudes)
 
 
 def _choose(part: str, parts: Sequence[str], kind: str) -> str:
@@ -82,31 +90,58 @@ def _choose(part: str, parts: Sequence[str], kind: str) -> str:
     )
 
 
+def _angles(quaternions: NDArray[np.float64], at: Any = None, to: Any = None) -> Any:
+    """Return yaw, pitch and roll [degrees] (M, 3), intrinsic about z, y and x, of quaternions
+    (N, 4) x, y, z, w at times `at`, interpolated to times `to`; None where they are not set or all
+    the identity that writers leave."""
+    norm = np.linalg.norm(quaternions, axis=1)
+    unset = (quaternions[:, :3] == 0).all()
+    if norm.size < 2 or unset or not (np.isfinite(norm) & (norm > 0)).all():
+        return None
+    turned = Rotation.from_quat(quaternions)
+    if at is not None:
+        at, first = np.unique(at, return_index=True)
+        turned = Slerp(at, turned[first])(np.clip(to, at[0], at[-1]))
+    return turned.as_euler("ZYX", degrees=True)
+
+
 def _ulog(file: Path, part: str) -> FlightLog:
     """Read the positions of a ULog: local ones are north, east and down from where the autopilot
-    began."""
-    log = needed("pyulog", "flights").ULog(str(file), [_LOCAL, _GLOBAL])
+    began; and its attitudes, which turn nose, right and down into these."""
+    log = needed("pyulog", "flights").ULog(str(file), [_LOCAL, _GLOBAL, _ATTITUDE])
     data: dict[str, Mapping[str, Any]] = {d.name: d.data for d in log.data_list if d.multi_id == 0}
+    attitude = data.pop(_ATTITUDE, None)
     name = _choose(part, list(data), "message with positions")
     c = data[name]
     valid = np.all([c[flag] > 0 for flag in _VALID if flag in c] or [[True]], axis=0)
-    stamp = c["timestamp_sample" if "timestamp_sample" in c else "timestamp"].astype(np.int64)
+    stamp, angles = _stamps(c), None
+    if attitude is not None:
+        q = np.column_stack([attitude[f"q[{k}]"].astype(float) for k in (1, 2, 3, 0)])
+        angles = _angles(q, _stamps(attitude), stamp)
     keys = ("lat", "lon", "alt") if name == _GLOBAL else ("y", "x", "z")
     positions = np.column_stack([c[key].astype(float) for key in keys])
     positions[:, 2] *= 1 if name == _GLOBAL else -1
     positions[~np.broadcast_to(valid, stamp.shape)] = np.nan
-    return FlightLog(name, (stamp - stamp[0]) * 1e-6, positions, name == _GLOBAL)
+    times = (stamp - stamp[0]) * 1e-6
+    return FlightLog(name, times, positions, name == _GLOBAL, attitudes=angles)
+
+
+def _stamps(message: Mapping[str, Any]) -> NDArray[np.int64]:
+    """Return when a message of a ULog holds [us]."""
+    key = "timestamp_sample" if "timestamp_sample" in message else "timestamp"
+    return np.asarray(message[key].astype(np.int64))
 
 
 def _bag(file: Path, part: str) -> FlightLog:
     """Read a topic of a bag of ROS 2. Times are those of the headers, from the first of all topics
-    with positions; axes are east, north and up (REP 103)."""
+    with positions; axes are east, north and up, a quaternion turns ahead, left and up into them
+    (REP 103)."""
     needed("rosbags", "flights")
     from rosbags.rosbag2 import Reader
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)  # types that a bag defines would become code
-    stamps, positions, first = [], [], math.inf
+    stamps, positions, quaternions, first = [], [], [], math.inf
     with Reader(file) as bag:
         placed = [c for c in bag.connections if c.msgtype in _TYPES]
         kinds = {c.topic: c.msgtype for c in placed}
@@ -124,9 +159,15 @@ def _bag(file: Path, part: str) -> FlightLog:
             else:
                 pose = message.pose.pose if connection.msgtype == _ODOMETRY else message.pose
                 p = pose.position.x, pose.position.y, pose.position.z
+                q = pose.orientation
+                quaternions.append((q.x, q.y, q.z, q.w))
             positions.append(p)
     times = np.array([stamp - first for stamp in stamps]) * 1e-9
-    return FlightLog(topic, times, np.reshape(positions, (-1, 3)), kinds[topic] == _FIX)
+    angles = _angles(np.reshape(quaternions, (-1, 4)))
+    if angles is not None:  # yaw counts from east to the left, pitch downwards
+        angles = angles * [-1, -1, 1] + [90, 0, 0]
+    places = np.reshape(positions, (-1, 3))
+    return FlightLog(topic, times, places, kinds[topic] == _FIX, attitudes=angles)
 
 
 def _sumo(file: Path, part: str) -> FlightLog:

@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pyproj
 import pytest
+from scipy.spatial.transform import Rotation
 
 from isac_rt.document import ScenarioError
 from isac_rt.runtime import UserError
@@ -45,19 +46,22 @@ def check(uav, after=0.0):
 # ---- PX4
 
 
-def ulog(file, name, fields, rows):
-    """A ULog of one message, by its specification: F names the fields, A subscribes, D holds."""
+def ulog(file, *messages):
+    """A ULog of messages (name, fields, rows), by its specification: F names the fields, A
+    subscribes, D holds."""
+    codes = {"uint64_t": "Q", "float": "f", "double": "d", "bool": "?", "float[4]": "4f"}
 
     def message(kind, content):
         return struct.pack("<HB", len(content), ord(kind)) + content
 
-    packed = "<" + "".join(
-        {"uint64_t": "Q", "float": "f", "double": "d", "bool": "?"}[t] for t, _ in fields
-    )
-    form = f"{name}:" + "".join(f"{kind} {field};" for kind, field in fields)
     parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", BEGUN_US)]
-    parts += [message("F", form.encode()), message("A", struct.pack("<BH", 0, 7) + name.encode())]
-    parts += [message("D", struct.pack("<H", 7) + struct.pack(packed, *row)) for row in rows]
+    for name, fields, _ in messages:
+        form = f"{name}:" + "".join(f"{kind} {field};" for kind, field in fields)
+        parts.append(message("F", form.encode()))
+    for number, (name, fields, rows) in enumerate(messages, start=7):
+        packed = "<H" + "".join(codes[kind] for kind, _ in fields)
+        parts.append(message("A", struct.pack("<BH", 0, number) + name.encode()))
+        parts += [message("D", struct.pack(packed, number, *row)) for row in rows]
     file.write_bytes(b"".join(parts))
 
 
@@ -80,7 +84,7 @@ def test_px4_local_positions(tmp_path, caplog):
     """North, east, down in microseconds since the board began; what the estimator calls invalid is
     left out. Planted bug: x taken as east; z upwards; the flag not asked for."""
     pytest.importorskip("pyulog")
-    ulog(tmp_path / "log.ulg", "vehicle_local_position", LOCAL, local_rows(lost=(17, 18)))
+    ulog(tmp_path / "log.ulg", ("vehicle_local_position", LOCAL, local_rows(lost=(17, 18))))
     with caplog.at_level("INFO", "isac_rt.taken"):
         check(fly(tmp_path, "log.ulg"))
     assert "log.ulg: vehicle_local_position, 39 positions, 4.0 s" in caplog.text
@@ -88,11 +92,63 @@ def test_px4_local_positions(tmp_path, caplog):
     check(fly(tmp_path, "log.ulg#@1.5"), after=1.5)
 
 
+def turned_by(t):
+    """Yaw from north to the right, pitch with the nose up and roll with the right side down
+    [degrees]."""
+    return np.stack([170 + 15 * t, 9 * np.sin(t), -12 + 5 * t], axis=-1)
+
+
+def axes(angles):
+    """Ahead, right and up in the world by three rotations of a drone that points north, by hand."""
+    yaw, pitch, roll = np.radians(angles)
+    ahead, right, up = np.eye(3)[[1, 0, 2]]
+    ahead, up = (
+        ahead * np.cos(pitch) + up * np.sin(pitch),
+        up * np.cos(pitch) - ahead * np.sin(pitch),
+    )
+    right, up = right * np.cos(roll) - up * np.sin(roll), up * np.cos(roll) + right * np.sin(roll)
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.stack([ahead, right, up]) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def check_attitude(uav):
+    """Hold arrays to the axes between the samples: right, ahead and up are the pose's columns."""
+    for t in (0.55, 1.234, 2.9):
+        ahead, right, up = axes(turned_by(t))
+        found = Trajectory(uav).pose(t).rotation
+        assert found == pytest.approx(np.stack([right, ahead, up], axis=1), abs=2e-4)
+
+
+def test_px4_attitudes(tmp_path, caplog):
+    """Quaternions w, x, y, z that turn nose, right, down into north, east, down, at other times
+    than the positions. A stated boresight stands in their place. Planted bugs: w last; the
+    attitude of the row with the position's number; pitch counted downwards."""
+    pytest.importorskip("pyulog")
+    times = np.arange(-0.2, 4.3, 0.025) + 0.007
+    rows = []
+    for t in times:
+        ahead, right, up = axes(turned_by(t))
+        frame = np.stack([ahead, right, -up])[:, [1, 0, 2]] * [1, 1, -1]  # rows: north, east, down
+        x, y, z, w = Rotation.from_matrix(frame.T).as_quat()
+        rows.append((BEGUN_US + round(1e6 * t), w, x, y, z))
+    fields = [("uint64_t", "timestamp"), ("float[4]", "q")]
+    place = "vehicle_local_position", LOCAL, local_rows()
+    ulog(tmp_path / "log.ulg", place, ("vehicle_attitude", fields, rows))
+    with caplog.at_level("INFO", "isac_rt.taken"):
+        uav = fly(tmp_path, "log.ulg")
+    check(uav)
+    check_attitude(uav)
+    assert "41 positions, 4.0 s, with attitudes" in caplog.text
+    scene = SCENE.replace('"LOG"', "log.ulg, boresight: [0, 1, 0]")
+    (tmp_path / "scene.yaml").write_text(scene)
+    assert load(tmp_path / "scene.yaml").swarm["T"].waypoints[0].attitude_deg is None
+
+
 def test_a_long_log_is_thinned(tmp_path, caplog):
     """12,000 rows become 4,000. Planted bug: the first 5,000."""
     pytest.importorskip("pyulog")
     times = np.arange(12_000) * 4 / 12_000
-    ulog(tmp_path / "log.ulg", "vehicle_local_position", LOCAL, local_rows(times))
+    ulog(tmp_path / "log.ulg", ("vehicle_local_position", LOCAL, local_rows(times)))
     with caplog.at_level("INFO", "isac_rt.taken"):
         uav = fly(tmp_path, "log.ulg")
     assert len(uav.waypoints) == 4000
@@ -138,7 +194,7 @@ def test_px4_global_positions_over_a_map(tmp_path):
         (BEGUN_US + round(1e6 * t), lat, lon, up)
         for t, (lon, lat, up) in zip(TIMES, on_earth(), strict=True)
     )
-    ulog(tmp_path / "log.ulg", "vehicle_global_position", fields, rows)
+    ulog(tmp_path / "log.ulg", ("vehicle_global_position", fields, rows))
     check(fly(tmp_path, "log.ulg", CITY))
     with pytest.raises(ScenarioError, match="no map says where on Earth"):
         fly(tmp_path, "log.ulg")
@@ -150,7 +206,7 @@ def test_damaged_logs_are_one_message(tmp_path):
     (tmp_path / "log.ulg").write_bytes(b"no log at all")
     with pytest.raises(ScenarioError, match=r"swarm\.T\.flight .*damaged or of another kind"):
         fly(tmp_path, "log.ulg")
-    ulog(tmp_path / "log.ulg", "sensor_accel", LOCAL, local_rows())
+    ulog(tmp_path / "log.ulg", ("sensor_accel", LOCAL, local_rows()))
     with pytest.raises(
         ScenarioError, match="name a message with positions as FILE#NAME; there are 0"
     ):
@@ -186,11 +242,10 @@ def bag(folder, topics):
                 writer.write(connection, late, store.serialize_cdr(make(types, header, i), kind))
 
 
-def pose_of(types, point):
+def pose_of(types, point, quaternion=(0.0, 0.0, 0.0, 1.0)):
     at = types["geometry_msgs/msg/Point"](*map(float, point))
-    return types["geometry_msgs/msg/Pose"](
-        at, types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-    )
+    turn = types["geometry_msgs/msg/Quaternion"](*map(float, quaternion))
+    return types["geometry_msgs/msg/Pose"](at, turn)
 
 
 def odometry(types, header, i):
@@ -231,6 +286,25 @@ def test_ros_topics(tmp_path, kind, make, caplog):
     with caplog.at_level("INFO", "isac_rt.taken"):
         check(fly(tmp_path, "bag", CITY))
     assert f"bag: /uav/at, {41 - 2 * (make is fix)} positions, 4.0 s" in caplog.text
+
+
+def test_ros_attitudes(tmp_path):
+    """Quaternions x, y, z, w that turn ahead, left, up into east, north, up. Identities throughout
+    are what writers leave: the UAV looks where it flies. Planted bugs: yaw from north; pitch
+    upwards."""
+
+    def turning(types, header, i):
+        ahead, right, up = axes(turned_by(TIMES[i]))
+        q = Rotation.from_matrix(np.stack([ahead, -right, up], axis=1)).as_quat()
+        pose = pose_of(types, curve(TIMES[i]), q)
+        return types["geometry_msgs/msg/PoseStamped"](header, pose)
+
+    kind = "geometry_msgs/msg/PoseStamped"
+    bag(tmp_path / "bag", {"/a": (kind, turning, TIMES), "/b": (kind, posed, TIMES)})
+    uav = fly(tmp_path, "bag#/a")
+    check(uav)
+    check_attitude(uav)
+    assert fly(tmp_path, "bag#/b").waypoints[0].attitude_deg is None
 
 
 def test_topics_of_a_bag_share_a_clock(tmp_path):
