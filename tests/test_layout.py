@@ -236,10 +236,10 @@ def test_compiled_functions_stand_in_their_room(path: Path):
 
 
 MAX_LINES = {
-    "kernels": 4430,
+    "kernels": 4000,
     "frame": 2822,
     "world": 3690,
-    "propagation": 4690,
+    "propagation": 4705,
     "signal": 820,
     "receive": 6065,
     "track": 1926,
@@ -306,7 +306,7 @@ def kernels_named(tree: ast.AST) -> set[str]:
 
 
 def test_every_kernel_that_a_room_calls_has_a_twin():
-    """Planted bug: `propagation_edges.near` called instead of its twin's name, without a twin."""
+    """Planted bug: `propagation_discs.near` called instead of its twin's name, without a twin."""
     named, twins = set(), set()
     for path in MODULES:
         if room_of(path) == "kernels":
@@ -321,5 +321,5 @@ def test_every_kernel_that_a_room_calls_has_a_twin():
         ]
         twins |= {ast.unparse(mark)[8:-1] for mark in marks}
         named |= kernels_named(tree)
-    assert len(named) > 20
+    assert len(named) >= 20
     assert named - twins == set()

@@ -6,14 +6,9 @@ import numpy as np
 
 from isac_rt.kernels.jit import jit
 from isac_rt.kernels.vector import (
-    LANES,
     PART,
     backwards,
-    cos_sin_double,
-    floor,
-    load,
     load_part,
-    narrow,
     splat_part,
     store,
     zip_high,
@@ -22,31 +17,6 @@ from isac_rt.kernels.vector import (
 
 ROWS = 24
 """Range cells of an antenna, all groups' chirps, that stay in the second-level cache."""
-
-
-@jit
-def fill_tones(frequency, out):
-    """`isac_rt.receive.spectrum.fill_tones`: of each sixteen samples the first one's phase, reduced
-    in float64, times those of sixteen from 0."""
-    blocks, flat = out.shape[1] // LANES, out.reshape(-1).view(np.float32)
-    whole = blocks + -blocks % LANES
-    index, starts = np.arange(whole).astype(np.float64), np.empty(2 * whole, np.float32)
-    at = 0
-    for p in range(frequency.size):
-        for b in range(0, whole, LANES):
-            cycles = LANES * frequency[p] * load(index, b)
-            c, s = cos_sin_double(cycles - floor(cycles + 0.5))
-            store(starts, b, narrow(c))
-            store(starts, whole + b, narrow(s))
-        cycles = frequency[p] * load(index, 0)
-        c, s = cos_sin_double(cycles - floor(cycles + 0.5))
-        lr, li = narrow(c), narrow(s)
-        for b in range(blocks):
-            c, s = starts[b], starts[whole + b]
-            re, im = c * lr - s * li, c * li + s * lr
-            store(flat, at, zip_low(re, im))
-            store(flat, at + LANES, zip_high(re, im))
-            at += 2 * LANES
 
 
 @jit(borrows=True)

@@ -22,90 +22,47 @@ _COS = tuple(np.float32(c) for c in (1, -1 / 2, 1 / 24, -1 / 720, 1 / 40320))
 
 
 @jit(inline=True)
-def _same(k):
-    """Four times the same word."""
-    return k, k, k, k
-
-
-@jit(inline=True)
-def _plus(a, b):
-    """Sums of four words and four others, modulo 2^32 as all below."""
-    return (
-        uint32(a[0] + b[0]),
-        uint32(a[1] + b[1]),
-        uint32(a[2] + b[2]),
-        uint32(a[3] + b[3]),
-    )
-
-
-@jit(inline=True)
-def _rotated(b, r):
-    """The bits of a word moved up by r places, around the end."""
-    return uint32(uint32(b << uint32(r)) | uint32(b >> uint32(32 - r)))
-
-
-@jit(inline=True)
 def _mix(a, b, r):
-    """One Threefry round: add, rotate, exclusive or."""
-    a = _plus(a, b)
-    return a, (
-        uint32(_rotated(b[0], r) ^ a[0]),
-        uint32(_rotated(b[1], r) ^ a[1]),
-        uint32(_rotated(b[2], r) ^ a[2]),
-        uint32(_rotated(b[3], r) ^ a[3]),
-    )
+    """One Threefry round, modulo 2^32 as all below: add, rotate, exclusive or."""
+    a = uint32(a + b)
+    return a, uint32(uint32(uint32(b << uint32(r)) | uint32(b >> uint32(32 - r))) ^ a)
 
 
 @jit(inline=True)
-def _four_rounds(a, b, even):
-    """Rounds with the rotations 13, 15, 26, 6 (even groups of four) or 17, 29, 16, 24 (odd
-    groups)."""
-    if even:
-        a, b = _mix(a, b, 13)
-        a, b = _mix(a, b, 15)
-        a, b = _mix(a, b, 26)
-        return _mix(a, b, 6)
+def _even_rounds(a, b):
+    """Four rounds of an even group."""
+    a, b = _mix(a, b, 13)
+    a, b = _mix(a, b, 15)
+    a, b = _mix(a, b, 26)
+    return _mix(a, b, 6)
+
+
+@jit(inline=True)
+def _odd_rounds(a, b):
+    """Four rounds of an odd group."""
     a, b = _mix(a, b, 17)
     a, b = _mix(a, b, 29)
     a, b = _mix(a, b, 16)
     return _mix(a, b, 24)
 
 
-@jit(inline=True)
-def _threefry(a, b, key0, key1):
-    """Two random words of each of four two-word counters under a two-word key (20 rounds). Every
-    operation waits for the one before; those of four counters do not wait for each other."""
-    key2 = uint32(uint32(key0 ^ key1) ^ _PARITY)
-    a, b = _plus(a, _same(key0)), _plus(b, _same(key1))
-    a, b = _four_rounds(a, b, True)
-    a, b = _plus(a, _same(key1)), _plus(b, _same(uint32(key2 + uint32(1))))
-    a, b = _four_rounds(a, b, False)
-    a, b = _plus(a, _same(key2)), _plus(b, _same(uint32(key0 + uint32(2))))
-    a, b = _four_rounds(a, b, True)
-    a, b = _plus(a, _same(key0)), _plus(b, _same(uint32(key1 + uint32(3))))
-    a, b = _four_rounds(a, b, False)
-    a, b = _plus(a, _same(key1)), _plus(b, _same(uint32(key2 + uint32(4))))
-    a, b = _four_rounds(a, b, True)
-    return _plus(a, _same(key2)), _plus(b, _same(uint32(key0 + uint32(5))))
-
-
 @jit(fast=True, borrows=True)
 def random_words(first_words, second_words, first, key0, key1):
-    """The two words of sample `first` of the stream and of those after it, a multiple of four."""
-    n, low, high = first_words.shape[0] // 4, uint32(first), uint32(first >> np.uint64(32))
-    for i in range(n):
-        a = _plus(_same(uint32(low + uint32(i))), (0, uint32(n), uint32(2 * n), uint32(3 * n)))
-        b = (
-            uint32(high + uint32(a[0] < low)),
-            uint32(high + uint32(a[1] < low)),
-            uint32(high + uint32(a[2] < low)),
-            uint32(high + uint32(a[3] < low)),
-        )
-        a, b = _threefry(a, b, key0, key1)
-        first_words[i], second_words[i] = a[0], b[0]
-        first_words[i + n], second_words[i + n] = a[1], b[1]
-        first_words[i + 2 * n], second_words[i + 2 * n] = a[2], b[2]
-        first_words[i + 3 * n], second_words[i + 3 * n] = a[3], b[3]
+    """The two words of sample `first` of the stream and of those after it: Threefry with 20 rounds
+    of a two-word counter under a two-word key."""
+    low, high = uint32(first), uint32(first >> np.uint64(32))
+    key2 = uint32(uint32(key0 ^ key1) ^ _PARITY)
+    one, two = uint32(key2 + uint32(1)), uint32(key0 + uint32(2))
+    three, four, five = uint32(key1 + uint32(3)), uint32(key2 + uint32(4)), uint32(key0 + uint32(5))
+    for i in range(first_words.shape[0]):
+        a = uint32(low + uint32(i))
+        b = uint32(uint32(high + uint32(a < low)) + key1)
+        a, b = _even_rounds(uint32(a + key0), b)
+        a, b = _odd_rounds(uint32(a + key1), uint32(b + one))
+        a, b = _even_rounds(uint32(a + key2), uint32(b + two))
+        a, b = _odd_rounds(uint32(a + key0), uint32(b + three))
+        a, b = _even_rounds(uint32(a + key1), uint32(b + four))
+        first_words[i], second_words[i] = uint32(a + key2), uint32(b + five)
 
 
 @jit(inline=True)

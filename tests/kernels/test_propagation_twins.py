@@ -7,7 +7,6 @@ import pytest
 from twins import assert_twins_agree
 
 from isac_rt.kernels.jit import TWINS
-from isac_rt.propagation.clutter import cells
 from isac_rt.propagation.clutter.field import Rows, Surfaces
 
 
@@ -43,30 +42,6 @@ def test_scatterers_in_flight(own):
     assert_twins_agree(name, surfaces, points, *each, 0.37, start, end, own, rows, rtol=2e-7)
 
 
-def test_planes_of_faces():
-    """Boxes that share some planes and not others. Planted bug: a plane taken for all that touch
-    it with one corner."""
-    rng = np.random.default_rng(9)
-    faces = []
-    for x, height in zip(rng.uniform(-50, 50, 12), rng.choice([5.25, 8.5], 12), strict=True):
-        a, b = np.array([x, 0.0, 0.0]), np.array([x + 3.3, 7.7, height])
-        for axis in range(3):
-            for end in (a, b):
-                square = np.array([a, a, b, b])
-                square[[1, 2], (axis + 1) % 3] = b[(axis + 1) % 3]
-                square[[0, 3], (axis + 1) % 3] = a[(axis + 1) % 3]
-                square[:, axis] = end[axis]
-                faces += [square[[0, 1, 2]], square[[0, 2, 3]]]
-    corners = np.array(faces)
-    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    size = np.linalg.norm(areas, axis=1)
-    order = np.argsort(-size, kind="stable")
-    corners, normals = corners[order], (areas / size[:, None])[order]
-    offsets = (normals * corners[:, 0]).sum(axis=1)
-    name = "isac_rt.world.city.mesh.group_planes"
-    assert_twins_agree(name, corners, normals, offsets, 1e-6, rtol=0)
-
-
 def test_segments_that_pass_a_disc():
     """Segments near and far, one of length zero, some spared. Planted bug: the distance before the
     segment left out of the Fresnel zone."""
@@ -83,31 +58,6 @@ def test_segments_that_pass_a_disc():
     for spared in (rng.random((count, discs)) < 0.2, rng.random((1, discs)) < 0.3):
         paths = starts, ends, before, total
         assert_twins_agree(name, *paths, places, radii, spared, 0.0039, 3.7, rtol=1e-12)
-
-
-@pytest.mark.sionna
-def test_edges_near_a_path():
-    """Edges strewn over 100 m and paths past them, of many with one near. Planted bug: the foot of
-    the near end weighed by its own distance from the edge."""
-    from isac_rt.propagation.segments.edges import Edges
-
-    rng = np.random.default_rng(10)
-    count = 700
-    start, span = rng.uniform(-50, 50, (count, 3)), rng.uniform(-9, 9, (count, 3))
-    wings = start[:, None] + rng.uniform(-9, 9, (count, 2, 3))
-    middle, half = start + span / 2, np.linalg.norm(span, axis=1) / 2
-    block = np.append(rng.permutation(count), np.full(4, -1)).reshape(-1, 32)
-    centre = middle[block[:, 0]]
-    apart = np.linalg.norm(middle[block] - centre[:, None], axis=2) + half[block]
-    radius = np.where(block < 0, 0.0, apart).max(axis=1)
-    edges = Edges(start, span, wings, middle, half, block, centre, radius)
-    name, found = "isac_rt.propagation.segments.edges.near", []
-    for source, sink in rng.uniform(-40, 40, (20, 2, 3)):
-        for reach in (0.07, 1.3, 30.0):
-            # a detour is a difference of lengths of 100 m
-            assert_twins_agree(name, edges, source, sink, reach, rtol=1e-12, atol=1e-12)
-            found.append(len(TWINS[name][1](edges, source, sink, reach)[0]))
-    assert 0 in found and max(found) == 24 and len(set(found)) > 5
 
 
 @pytest.mark.sionna
@@ -138,23 +88,3 @@ def test_chains_that_reach_a_place(depth):
     assert_twins_agree(name, *arguments, rtol=0)
     lengths = (TWINS[name][1](*arguments)[:, 1:] >= 0).sum(axis=1)
     assert {*lengths} == set(range(1, depth + 1)) and len(lengths) > 10
-
-
-def test_cells_of_a_surface():
-    """Faces large and small, near a flight and beyond the reach; and the end where there are too
-    many. Planted bugs: the second of equally long edges halved; a cell's radius left out of its
-    distance."""
-    rng = np.random.default_rng(12)
-    middle = rng.uniform(-60, 60, (40, 1, 3))
-    corners = middle + rng.uniform(-1, 1, (40, 3, 3)) * rng.uniform(1, 30, (40, 1, 1))
-    corners[0] = 8.7 * np.sqrt([[0, 0, 0], [1, 0, 0], [0.25, 0.75, 0]])  # sides alike
-    span = corners[:, 1:] - corners[:, :1]
-    area = np.linalg.norm(np.cross(span[:, 0], span[:, 1]), axis=1) / 2
-    state = rng.integers(0, 2**63, 40).astype(np.uint64)
-    places = np.linspace([-30.3, 5.1, 12.2], [44.1, -3.7, 15.9], 83)
-    arguments = (corners, area, state), places, cells._boxes(places), (0.13, 0.21, 7.3, 55.7)
-    name = "isac_rt.propagation.clutter.cells.leaves"
-    # an area halved is exact, a point is as good as its corners
-    assert_twins_agree(name, *arguments, 100_000, rtol=1e-14)
-    assert TWINS[name][1](*arguments, 100_000)[0] > 1_000
-    assert [f(*arguments, 900)[0] for f in TWINS[name]] == [901, 901]

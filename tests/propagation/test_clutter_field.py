@@ -134,6 +134,28 @@ def halved(
     return one + halved(np.array([(p + q) / 2, q, r]), places, density, 2 * code + 1)
 
 
+def test_cells_are_those_of_a_recursion():
+    """Sequences of halvings and areas, face by face, with finer cells near the flight and one
+    triangle of equal sides. Planted bugs: the second of equally long edges halved; a cell's radius
+    left out of its distance."""
+    rng = np.random.default_rng(12)
+    corners = rng.uniform(-60, 60, (40, 1, 3)) + rng.uniform(-20, 20, (40, 3, 3))
+    corners[0] = 48.7 * np.sqrt([[0, 0, 0], [1, 0, 0], [0.25, 0.75, 0]])
+    sides = corners[:, 1:] - corners[:, :1]
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
+    places = np.linspace([-30.3, 5.1, 12.2], [44.1, -3.7, 15.9], 83)
+    density = Density(0.13, 0.21, 7.3)
+    expected = [
+        (row, *cell) for row in range(40) for cell in sorted(halved(corners[row], places, density))
+    ]
+    faces = corners, area, np.arange(40, dtype=np.uint64)
+    of = (density.per_metre, density.smallest, density.near, np.inf)
+    count, rows, codes, areas, _, _ = clutter_cells.leaves(faces, places, of, 100_000)
+    assert count == len(expected) > 1_000
+    assert [*zip(rows.tolist(), codes.tolist(), strict=True)] == [cell[:2] for cell in expected]
+    assert areas == pytest.approx([cell[2] for cell in expected], rel=1e-9)
+
+
 def test_one_cell_too_many_is_refused(monkeypatch):
     """As many as allowed are cut, and one more is refused. Planted bug: what waits is counted
     twice."""

@@ -14,13 +14,12 @@ from truths.clutter import crossing
 
 from isac_rt import scenario
 from isac_rt.frame.link import Link
-from isac_rt.kernels.propagation_edges import MOST_TRIED, near
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.propagation.segments import edges as edges_of_cities
 from isac_rt.propagation.segments.direct import direct_segments
 from isac_rt.propagation.segments.discs import UavDiscs
-from isac_rt.propagation.segments.edges import Edges
+from isac_rt.propagation.segments.edges import MOST_TRIED, Edges, near
 from isac_rt.simulation.setup import propagation_in
 from isac_rt.world.city import CityMesh
 from isac_rt.world.city.mesh import empty_city
@@ -271,9 +270,10 @@ def test_no_edge_near_a_path_is_passed_over(together, monkeypatch):
     city = CityMesh("strewn", vertices, faces, np.zeros(333, np.int16), (METAL,), origin)
     edges, found = Edges.of(city), 0
     a, b = corners, np.roll(corners, -1, axis=1)
-    for _ in range(100):
-        ends = source, sink = rng.uniform(-100, 100, (2, 3))
-        reach = 10 ** rng.uniform(-1, 0.5)
+    sources, sinks = rng.uniform(-100, 100, (2, 100, 3))
+    reach = 10 ** rng.uniform(-1, 0.5, 100)
+    path, detours, _, _ = near(edges, sources, sinks, reach)
+    for k, ends in enumerate(zip(sources, sinks, strict=True)):
         low, high = np.zeros((333, 3, 1)), np.ones((333, 3, 1))
 
         def detour(share, ends=ends):
@@ -286,7 +286,7 @@ def test_no_edge_near_a_path_is_passed_over(together, monkeypatch):
             left = detour(one) < detour(other)
             low, high = np.where(left, low, one), np.where(left, other, high)
         every = np.sort(detour(low).ravel())
-        every = every[every < reach][:MOST_TRIED]
-        assert near(edges, source, sink, reach)[0] == pytest.approx(every, abs=1e-9)
+        every = every[every < reach[k]][:MOST_TRIED]
+        assert detours[path == k] == pytest.approx(every, abs=1e-9)
         found += every.size
     assert found > 300

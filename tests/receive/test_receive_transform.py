@@ -63,10 +63,12 @@ def test_transform_is_the_sum(size: int, chirps: int, plain: bool):
 
 
 def test_tones_are_exponentials():
-    """Planted bug: the phase of the fine steps reduced modulo 3/2."""
+    """Planted bugs: the phase of the fine steps reduced modulo 3/2; factors rounded to complex64
+    before their product."""
     frequency = np.array([0.37213, -211.0921, 1e6 + 0.2913])
     expected = np.exp(2j * np.pi * np.outer(frequency, np.arange(75)))
-    # rounding of complex64, and of a float64 phase of 75e6 cycles in `expected`
+    # one rounding to complex64, and that of a float64 phase of 75e6 cycles in `expected`
+    assert np.abs(tones(frequency, 75)[:2] - expected[:2]).max() < 5e-8
     assert np.abs(tones(frequency, 75) - expected).max() < 2e-7
 
 

@@ -14,7 +14,7 @@ import trimesh
 
 from isac_rt import scenario
 from isac_rt.extensions.city_files.extrude import building
-from isac_rt.world.city import CityError, CityMesh, load_city, parametric
+from isac_rt.world.city import CityError, CityMesh, load_city, mesh, parametric
 from isac_rt.world.city.georeference import is_lonlat
 from isac_rt.world.city.materials import (
     KNOWN_MATERIALS,
@@ -277,6 +277,38 @@ def test_float32_files_get_their_own_plane_tolerance():
         node(source="builtin", name="simple_street_canyon"), ".", F_C, (3.3, 1.7, 20.1)
     )
     assert 1e-6 < canyon.plane_tolerance < 1e-4
+
+
+@pytest.mark.parametrize("sweep", [3, 256])
+def test_planes_of_boxes_are_those_of_a_search_through_all_faces(sweep, monkeypatch):
+    """Boxes that share some planes and not others. Planted bugs: a plane taken for all that touch
+    it with one corner; faces that have a plane get another one."""
+    rng = np.random.default_rng(9)
+    faces = []
+    for x, height in zip(rng.uniform(-50, 50, 12), rng.choice([5.25, 8.5], 12), strict=True):
+        start = rng.choice([0.0, 0.8e-6, 1.6e-6])  # the second in the planes of both others
+        a, b = np.array([x, start, 0.0]), np.array([x + 3.3, 7.7, height])
+        for axis in range(3):
+            for end in (a, b):
+                square = np.array([a, a, b, b])
+                square[[1, 2], (axis + 1) % 3] = b[(axis + 1) % 3]
+                square[[0, 3], (axis + 1) % 3] = a[(axis + 1) % 3]
+                square[:, axis] = end[axis]
+                faces += [square[[0, 1, 2]], square[[0, 2, 3]]]
+    corners = np.array(faces)
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(areas, axis=1)
+    order = np.argsort(-size, kind="stable")
+    corners, normals = corners[order], (areas / size[:, None])[order]
+    offsets = (normals * corners[:, 0]).sum(axis=1)
+    expected = np.full(len(corners), -1)
+    for seed in range(len(corners)):
+        if expected[seed] < 0:
+            apart = [abs(normals[seed] @ corner.T - offsets[seed]).max() for corner in corners]
+            expected[(expected < 0) & (np.array(apart) <= 1e-6)] = expected.max() + 1
+    assert len(set(expected)) < len(expected) / 2
+    monkeypatch.setattr(mesh, "PLANES_PER_SWEEP", sweep)
+    np.testing.assert_array_equal(mesh.group_planes(corners, normals, offsets, 1e-6), expected)
 
 
 # ---- cleaning

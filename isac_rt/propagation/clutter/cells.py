@@ -15,9 +15,6 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from isac_rt.kernels import propagation_cells
-from isac_rt.kernels.jit import twin_of
-from isac_rt.kernels.propagation_cells import ALIKE, BOX, FINER
 from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import seed_sequence, splitmix64
 from isac_rt.world.city.materials import CityError
@@ -27,6 +24,10 @@ UNIT = 1e-6 * np.sqrt(2)
 """Step of world coordinates before hashing [m]. Irrational: no coordinate of a file lies half-way
 between two steps, where recentring of the city could change its rounding."""
 MOST_CELLS = 8_000_000
+ALIKE = 1e-9
+"""Edges whose lengths differ by less than this share are equally long; then the first is halved."""
+FINER = 4.0
+"""Cells near a flight that share the surface of one, where a density asks for it."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,6 @@ def cut(
     count, rows, *parts = leaves(
         (corners, city.areas[face], _face_state(corners + city.origin, seed)),
         positions,
-        _boxes(positions),
         (*astuple(density), city.reach),
         MOST_CELLS,
     )
@@ -163,11 +163,9 @@ def cut(
     return Cells(points, areas.astype(np.float32), amplitude, own, codes, clock / areas)
 
 
-@twin_of(propagation_cells.leaves)
 def leaves(
     faces: tuple[np.ndarray, np.ndarray, np.ndarray],
     positions: np.ndarray,
-    boxes: np.ndarray,
     density: tuple[float, float, float, float],
     most: int,
 ) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -181,68 +179,66 @@ def leaves(
     """
     per_metre, smallest, near, farthest = density
     corners, area, state = faces
-    row, code, tree = np.arange(len(area)), np.ones(len(area), np.uint64), cKDTree(positions)
-    done = [(row[:0], code[:0], area[:0])]
-    points = [corners[:0]]
-    while row.size:
-        # leave out cells beyond the reach of all flights
-        inside = (corners.min(axis=1).max(axis=1) <= farthest) & (
-            corners.max(axis=1).min(axis=1) >= -farthest
-        )
-        row, code, area, corners = (part[inside] for part in (row, code, area, corners))
-        if sum(len(part[0]) for part in done) + len(row) > most:
-            return most + 1, row[:0], code[:0], area[:0], state[:0], corners[:0, 0]
+    tree, count, done = cKDTree(positions), 0, list[tuple[np.ndarray, ...]]()
+    corners = np.ascontiguousarray(np.moveaxis(corners, 0, 2))  # (corner, axis, cell)
+    cells: tuple[np.ndarray, ...]
+    cells = np.arange(len(area)), np.ones(len(area), np.uint64), area, corners
+    while cells[0].size or not done:
+        if farthest < np.inf:  # leave out cells beyond the reach of all flights
+            low, high = cells[3].min(axis=0).max(axis=0), cells[3].max(axis=0).min(axis=0)
+            cells = _some(cells, (low <= farthest) & (high >= -farthest))
+        row, code, area, corners = cells
+        if count + len(row) > most:
+            return most + 1, row[:0], code[:0], area[:0], state[:0], corners[0, :, :0].T
         # least distance of a cell's bounding ball to any flight, against what its area needs
-        middle = corners.mean(axis=1)
-        radius = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
-        distance = np.maximum(tree.query(middle)[0] - radius, 0)
+        middle = corners.sum(axis=0) / 3
+        radius = np.sqrt(((corners - middle) ** 2).sum(axis=1).max(axis=0))
+        distance = np.maximum(tree.query(middle.T)[0] - radius, 0)
         finer = np.where(FINER * area > smallest, np.minimum(FINER * area / per_metre, near), 0)
         large = distance < np.maximum(np.where(area > smallest, area / per_metre, 0), finer)
-        done.append((row[~large], code[~large], area[~large]))
-        points.append(corners[~large])
-        # halve those too large
-        row, area = np.repeat(row[large], 2), np.repeat(area[large] / 2, 2)
-        code = (2 * code[large, None] + np.arange(2, dtype=np.uint64)).ravel()
-        corners = _halves(corners[large])
-    row, code, area = (np.concatenate(parts) for parts in zip(*done, strict=True))
-    order = np.lexsort([code, row])
-    row, code, area = row[order], code[order], area[order]
+        done.append(_some(cells, ~large))
+        count += len(done[-1][0])
+        row, code, area, corners = _some(cells, large)
+        code = np.stack([2 * code, 2 * code + 1], axis=1).ravel()
+        cells = np.repeat(row, 2), code, np.repeat(area / 2, 2), _halves(corners)
+    cells = tuple(np.concatenate(part, axis=-1) for part in zip(*done, strict=True))
+    row, code, area, corners = _some(cells, np.lexsort([cells[1], cells[0]]))
     own = splitmix64(state[row], code)
-    return len(row), row, code, area, own, _points_in(np.concatenate(points)[order], own)
+    return len(row), row, code, area, own, _points_in(corners, own)
+
+
+def _some(arrays: tuple[np.ndarray, ...], which: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Select along the last axis by a mask or an index array."""
+    index = np.flatnonzero(which) if which.dtype == bool else which
+    return tuple(part.take(index, axis=-1) for part in arrays)
 
 
 def _halves(corners: np.ndarray) -> np.ndarray:
-    """Halve triangles (K, 3, 3) at the middle of the longest edge, the first of equal ones:
-    (2 K, 3, 3)."""
-    length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    first = (length >= length.max(axis=1, keepdims=True) * (1 - ALIKE)).argmax(axis=1)
-    turned = np.take_along_axis(corners, ((first[:, None] + np.arange(3)) % 3)[..., None], axis=1)
-    a, b, c = np.moveaxis(turned, 1, 0)
-    middle = (a + b) / 2
-    return np.stack([a, middle, c, middle, b, c], axis=1).reshape(-1, 3, 3)
+    """Halve triangles (corner, axis, K) at the middle of the longest edge, the first of equal ones:
+    (corner, axis, 2 K)."""
+    length = np.sqrt(((np.roll(corners, -1, axis=0) - corners) ** 2).sum(axis=1))
+    first = (length >= length.max(axis=0) * (1 - ALIKE)).argmax(axis=0)
+    turned = (first + np.arange(3)[:, None]) % 3
+    a, b, c = np.take_along_axis(corners, turned[:, None], axis=0)
+    middle, both = (a + b) / 2, np.empty((*corners.shape, 2))
+    both[..., 0], both[..., 1] = (a, middle, c), (middle, b, c)
+    return both.reshape(3, 3, -1)
 
 
 def _points_in(corners: np.ndarray, state: np.ndarray) -> np.ndarray:
-    """Draw a point in each triangle (K, 3, 3), uniform by area, hashed from states (K,)."""
+    """Draw a point (K, 3) in each triangle (corner, axis, K), uniform by area, hashed from states
+    (K,)."""
     words = np.arange(2, dtype=np.uint64)[:, None]
     hashed = (splitmix64(state, words) >> np.uint64(11)).astype(np.float64)
-    one, share = ((hashed + 0.5) / 2**53)[..., None]
-    a, b, c = np.moveaxis(corners, 1, 0)
-    return a + np.sqrt(one) * (b - a + share * (c - b))
+    root, share = np.sqrt((hashed[0] + 0.5) / 2**53), (hashed[1] + 0.5) / 2**53
+    a, b, c = corners
+    return np.ascontiguousarray(((1 - root) * a + root * ((1 - share) * b + share * c)).T)
 
 
 def _sorted_corners(corners: np.ndarray) -> np.ndarray:
     """Sort the corners (F, 3, 3) of each face by x, then y, then z."""
     rank = np.lexsort((corners[..., 2], corners[..., 1], corners[..., 0]), axis=1)
     return np.take_along_axis(corners, rank[..., None], axis=1)
-
-
-def _boxes(positions: np.ndarray) -> np.ndarray:
-    """Return lowest and highest coordinates (B, 2, 3) of every `BOX` positions (K, 3)."""
-    first = np.arange(0, len(positions), BOX)
-    return np.stack(
-        [np.minimum.reduceat(positions, first), np.maximum.reduceat(positions, first)], 1
-    )
 
 
 def _face_state(corners: np.ndarray, seed: int) -> np.ndarray:

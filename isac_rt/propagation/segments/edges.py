@@ -16,9 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isac_rt.kernels import propagation_edges
-from isac_rt.kernels.jit import twin_of
-from isac_rt.kernels.propagation_edges import MOST_TRIED
 from isac_rt.propagation.segments.diffraction import LIT_REACH, SHADOW_REACH
 from isac_rt.propagation.segments.rays import LosTest
 from isac_rt.world.city.mesh import CityMesh
@@ -29,6 +26,8 @@ good to a hundredth of that."""
 EDGES_PER_BLOCK, STRIP = 32, 30.0
 """Edges of a block, which are passed over at once, and width of the strips in which edges are
 gathered [m]."""
+MOST_TRIED = 24
+"""Edges near a path, the shortest detours first, that are tried."""
 FLAT = 1e-3
 """Sine of the angle between two faces under which the edge between them is none."""
 
@@ -119,12 +118,9 @@ class ShadowEdges:
         lit = self._los.clear(starts, ends)
         nu[~lit] = np.inf
         reach = np.where(lit, LIT_REACH, SHADOW_REACH) ** 2 / 4 * self._wavelength
-        edges = self._edges
-        found = [near(edges, s, e, far) for s, e, far in zip(starts, ends, reach, strict=True)]
-        path = np.repeat(np.arange(count), [len(f[0]) for f in found])
+        path, detour, at, out = near(self._edges, starts, ends, reach)
         if not path.size:
             return Diffractions(nu, points)
-        detour, at, out = (np.concatenate(part) for part in zip(*found, strict=True))
         ahead = (ends - starts)[path]
         ahead *= BESIDE / np.linalg.norm(ahead, axis=1, keepdims=True)
         free, behind = at + BESIDE * out, at - BESIDE * out
@@ -143,38 +139,65 @@ class ShadowEdges:
         return Diffractions(nu, points)
 
 
-@twin_of(propagation_edges.near)
 def near(
-    edges: Edges, source: np.ndarray, sink: np.ndarray, reach: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the silhouette edges near a straight path (3,) to (3,), at most `MOST_TRIED`.
+    edges: Edges, sources: np.ndarray, sinks: np.ndarray, reach: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Find the silhouette edges near straight paths (K, 3) to (K, 3), at most `MOST_TRIED` each.
 
     The shortest way over an edge makes equal angles with it on both sides (Fermat): its point
     divides the edge between the feet of both ends as their distances from the edge.
 
     Returns
     -------
-    detour : (K,) at most `reach`, shortest first [m]
-    point : (K, 3) of the shortest way, on the edge
-    out : (K, 3) unit vectors across the path and the edge, away from what the edge bounds
+    path : (N,) number of the path
+    detour : (N,) at most the `reach` (K,) of the path, shortest first [m]
+    point : (N, 3) of the shortest way, on the edge
+    out : (N, 3) unit vectors across the path and the edge, away from what the edge bounds
     """
-    unit = edges.span / (2 * edges.half[:, None])
-    ahead = (sink - source) / np.linalg.norm(sink - source)
-    foot, off = [], []
-    for end in (source, sink):
-        foot.append(((end - edges.start) * unit).sum(axis=1))
-        off.append(np.linalg.norm(np.cross(end - edges.start, unit), axis=1))
+    length = np.linalg.norm(sinks - sources, axis=1)
+    # half the width of the ellipsoid of all points within reach, and its ends
+    aside = np.sqrt(reach * (reach + 2 * length)) / 2 + reach
+    blocks = [
+        np.flatnonzero(_off(edges.centre, *ends) <= edges.radius + far)
+        for *ends, far in zip(sources, sinks, aside, strict=True)
+    ]
+    path = np.repeat(np.arange(len(sources)), [edges.block[block].size for block in blocks])
+    some = edges.block[np.concatenate(blocks)].ravel()
+    ball = edges.half[some] + aside[path]
+    inside = (some >= 0) & (_off(edges.middle[some], sources[path], sinks[path]) <= ball)
+    order = np.lexsort([some[inside], path[inside]])
+    path, some = path[inside][order], some[inside][order]
+    start, size = edges.start[some], 2 * edges.half[some]
+    unit, both = edges.span[some] / size[:, None], (sources[path], sinks[path])
+    foot = [_dot(end - start, unit) for end in both]
+    across = [end - start - at[:, None] * unit for end, at in zip(both, foot, strict=True)]
+    off = [np.sqrt(_dot(line, line)) for line in across]
     off_sum = off[0] + off[1]
     at = (foot[0] * off[1] + foot[1] * off[0]) / np.maximum(off_sum, 1e-9)
-    point = edges.start + np.clip(at, 0, 2 * edges.half)[:, None] * unit
-    length = sum(np.linalg.norm(point - end, axis=1) for end in (source, sink))
-    detour = length - np.linalg.norm(sink - source)
-    normal = np.cross(unit, ahead)
-    size = np.linalg.norm(normal, axis=1)
+    point = start + np.clip(at, 0, size)[:, None] * unit
+    detour = sum(np.linalg.norm(point - end, axis=1) for end in both) - length[path]
+    normal = np.cross(unit, both[1] - both[0]) / length[path, None]
+    sine = np.linalg.norm(normal, axis=1)
     # a silhouette: both faces lie on one side of the plane of the path and the edge
-    side = ((edges.wings - edges.start[:, None]) * normal[:, None]).sum(axis=2)
-    some = (off_sum >= 1e-9) & (detour <= reach) & (size >= 1e-6) & (side.prod(axis=1) > 0)
-    which = np.flatnonzero(some)
-    which = which[np.argsort(detour[which], kind="stable")][:MOST_TRIED]
-    out = normal[which] / np.where(side[which, :1] < 0, 1, -1) / size[which, None]
-    return detour[which], point[which], out
+    side = ((edges.wings[some] - start[:, None]) * normal[:, None]).sum(axis=2)
+    true = (off_sum >= 1e-9) & (detour <= reach[path]) & (sine >= 1e-6) & (side.prod(axis=1) > 0)
+    which = np.flatnonzero(true)
+    which = which[np.lexsort([detour[which], path[which]])]
+    rank = np.arange(which.size) - np.searchsorted(path[which], path[which])
+    which = which[rank < MOST_TRIED]
+    out = normal[which] / np.where(side[which, :1] < 0, 1, -1) / sine[which, None]
+    return path[which], detour[which], point[which], out
+
+
+def _off(points: np.ndarray, source: np.ndarray, sink: np.ndarray) -> np.ndarray:
+    """Return the distances of points (N, 3) from the straight segments between places, (3,)
+    or (N, 3)."""
+    to, span = points - source, sink - source
+    share = _dot(to, span) / _dot(span, span)
+    off = to - np.clip(share, 0, 1)[:, None] * span
+    return np.asarray(np.sqrt(_dot(off, off)))
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the inner products of vectors (N, 3), or (3,), faster than by the sum of products."""
+    return np.asarray(np.einsum("...i,...i", a, b))

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isac_rt.kernels import world_mesh
-from isac_rt.kernels.jit import twin_of
 from isac_rt.storage import cached
 from isac_rt.world.city.georeference import GeoReference
 from isac_rt.world.city.heights import HIGHEST_M
 from isac_rt.world.city.materials import CityError, Material, MaterialUse
 
 _LOG = logging.getLogger(__name__)
+PLANES_PER_SWEEP = 256
+"""Planes after which the faces that have one are no longer asked."""
 PLANE_TOLERANCE = 1e-6
 """Two faces share a plane if all corners of one lie this close to the plane of the other. [m]"""
 MIN_CACHED_FACES = 3000
@@ -426,7 +426,6 @@ def clean(
     return local[used], index.reshape(-1, 3).astype(np.int32), owner, notes, tolerance
 
 
-@twin_of(world_mesh.group_planes)
 def group_planes(
     corners: NDArray[np.float64],
     normals: NDArray[np.float64],
@@ -435,12 +434,18 @@ def group_planes(
 ) -> NDArray[np.int64]:
     """Group faces (F, 3, 3), sorted by falling area, by plane: the largest that is left takes all
     whose corners lie this close to its plane. Numbers (F,) of the planes."""
-    plane = np.full(len(corners), -1, np.int64)
+    plane, number = np.full(len(corners), -1, np.int64), 0
+    left, first = np.arange(len(corners)), np.ascontiguousarray(corners[:, 0])
     for seed in range(len(corners)):
-        if plane[seed] < 0:
-            left = np.flatnonzero(plane < 0)
-            near = np.abs(corners[left] @ normals[seed] - offsets[seed]) <= tolerance
-            number = plane.max() + 1
-            plane[left[near.all(axis=1)]] = number
-            plane[seed] = number
+        if plane[seed] >= 0:
+            continue
+        # one corner decides most
+        some = left[np.abs(first @ normals[seed] - offsets[seed]) <= tolerance]
+        near = np.abs(corners[some] @ normals[seed] - offsets[seed]) <= tolerance
+        some = some[near.all(axis=1) & (plane[some] < 0)]
+        plane[some] = plane[seed] = number
+        number += 1
+        if number % PLANES_PER_SWEEP == 0:
+            still = plane[left] < 0
+            left, first = left[still], first[still]
     return plane
