@@ -91,7 +91,10 @@ class StaticClutter(TrackRule):
     def prune(self, tracker: Tracker, own: Ownship) -> None:
         """End the tracks that are static within a crowd, and those, not confirmed before, that
         an echo of one carries on: from beyond the view and along a wall they seem
-        to move."""
+        to move. Two hits confirm no track within a crowd: chance carries it from spot to spot."""
+        for track in tracker.tracks:
+            early = track.id in own.tentative and sum(track.recent) < tracker.settings.confirm_window
+            track.confirmed &= not (early and self._neighbours(track) >= CROWD)
         fed = {t.id for t in tracker.tracks if t.detection >= 0 and self._crowd[t.detection]}
         still = {t.id for t in tracker.tracks if self.holds(t)}
         tracker.drop(still | (fed & own.tentative))
@@ -133,6 +136,11 @@ class StaticClutter(TrackRule):
         place = place[each, best]
         self._note(place[some := still & d.starts & ~d.is_reference], d.snr[some], time)
         return still & self.crowded(place, d.snr)
+
+    def _neighbours(self, track: Track) -> int:
+        """Count the spots beside a track."""
+        away = np.linalg.norm(self.state.spots[:, :3] - track.state.mean[:3], axis=1)
+        return int(((away > BESIDE_M[0]) & (away < BESIDE_M[1])).sum())
 
     def _note(self, places: np.ndarray, snr: np.ndarray, time: float) -> None:
         """Follow the spots to a frame's echoes (n, 3): each echo carries on the nearest one."""
