@@ -162,6 +162,7 @@ def quadratic_forms(matrices, order, x, z, out):
     count, pair, wide, high = order.size, 2 * LANES, x.cosines.shape[0], z.cosines.shape[0]
     num_x, num_z = x.cosines.shape[1], z.cosines.shape[1]
     two, least = np.float32(2), splat(np.float32(1e-6))
+    none, one = np.int64(0), np.int64(1)  # bare numbers have callees compiled for them too
     channels_read = np.empty(count * count * pair, np.float32)
     total = np.empty(wide * high * LANES, np.float32)
     near, flat = np.empty(num_z * pair, np.float32), out.reshape(-1)
@@ -181,14 +182,14 @@ def quadratic_forms(matrices, order, x, z, out):
                     value, at = matrix[order[m], order[n]], (n * count + m) * pair + s
                     channels_read[at], channels_read[at + LANES] = value.real, value.imag
         total[:] = 0.0
-        _within(channels_read, count, 0, x, total, high, 1)
-        _within(channels_read, count, num_x, z, total, 1, high)
+        _within(channels_read, count, none, x, total, high, one)
+        _within(channels_read, count, num_x, z, total, one, high)
         for i in range(wide):
             for p in range(x.ends.size - 1):
                 for r in range(z.ends.size - 1):
                     c, d = splat(two * z.phasors[0, r, i]), splat(two * z.phasors[1, r, i])
                     for n in range(z.ends[r], z.ends[r + 1]):
-                        re, im = _sum(channels_read, count, num_x + n, x, p, 0, i)
+                        re, im = _sum(channels_read, count, num_x + n, x, p, none, i)
                         store(near, n * pair, re * c + im * d)
                         store(near, n * pair + LANES, im * c - re * d)
                 for j in range(high):
@@ -259,7 +260,7 @@ def covariances(cells, scatterers, tables, shape, out):
     )
     sums = np.zeros((2, size, width), np.float32)
     for c in range(rows.size):
-        sums[:], count = 0.0, 0
+        sums[:], count = 0.0, np.int64(0)  # as above
         for i in range(-REACH, REACH + 1):
             row = rows[c] + i
             if row < 0 or row >= (start.size - 1) // num_bins:
@@ -282,7 +283,7 @@ def covariances(cells, scatterers, tables, shape, out):
                     count += 1
                     if count == SCATTERERS_PER_BATCH:
                         _add_products(re, im, count, size, sums)
-                        count = 0
+                        count = np.int64(0)
         _add_products(re, im, count, size, sums)
         for k in range(size):
             for m in range(k):

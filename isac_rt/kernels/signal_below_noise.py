@@ -610,7 +610,7 @@ def add_below_noise(grids, paths, segment, chirps, t, w, buffer, workspace):
             _amplitudes(workspace, paths, first, last, antenna)
             _weigh(workspace, antenna, w, buffer)
             workspace.sums[:_LINE] = np.float32(0)
-            i, line, pending = begin, 0.0, False
+            i, line, pending = begin, 0.0, np.bool_(False)  # bare: a second `_gather`
             while pending or i < stop:
                 count, i, line, pending = _gather(workspace, order, below, i, stop, line, pending)
                 _factors(workspace, count, antenna, w, buffer)
