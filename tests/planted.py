@@ -313,7 +313,7 @@ OF_CASES = {
     "births and deaths": Bug(
         "kernels/signal_direct.py", "or time >= t.end[k]", "or time >= t.end[k] + 1e9"
     ),
-    "data are taken out": Bug(
+    "data are removed": Bug(
         "receive/spectrum.py",
         "tones(shift[m] / num_samples, num_rows).T",
         "tones(-shift[m] / num_samples, num_rows).T",
@@ -330,7 +330,7 @@ OF_CASES = {
         "kernels/signal_noise.py", "c = _COS[0] + q * (", "c = _COS[0] + np.float32(0.9) * q * ("
     ),
     "noise does not know the order of work": Bug(
-        "kernels/signal_noise.py", "_same(uint32(low + uint32(i)))", "_same(uint32(i))"
+        "kernels/signal_noise.py", "a = uint32(low + uint32(i))", "a = uint32(i)"
     ),
     "dpsk symbol errors": Bug(
         "receive/symbols.py",

@@ -93,4 +93,7 @@ def test_a_run_opens_nothing_but_the_scenario(folder):
     opened = {
         found[2] for pid, call in lines if pid not in elsewhere and (found := named.search(call))
     }
-    assert {name for name in opened - {"."} if not name.startswith("out")} == {"s.yaml"}
+    inside = {(folder / name).resolve() for name in opened}  # numba opens the program's by ../
+    inside = {place for place in inside if place.is_relative_to(folder)}
+    names = {str(place.relative_to(folder)) for place in inside}
+    assert {name for name in names - {"."} if not name.startswith("out")} == {"s.yaml"}

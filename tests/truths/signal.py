@@ -471,7 +471,7 @@ def births_and_deaths() -> Errors:
 
 
 @case("the frame without data", "2e-6 of the peak", "complex64 samples and transform")
-def data_are_corrected() -> Errors:
+def data_are_removed() -> Errors:
     """A modulated frame with its data removed equals the unmodulated frame, at whole and fractional
     cells."""
     w, schedule, payload = stage.frame(w=Waveform(num_samples=256, num_chirps=30))
