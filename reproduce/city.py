@@ -355,7 +355,7 @@ def _goals_of_data(outcomes: Outcomes) -> Iterator[Goal]:
         before = data[:, 0] < SHADOW_END
         read.append(int((good & before).sum()))
         late.append(int((~good & (data[:, 0] >= SEES_AGAIN)).sum()))
-        counts += data[good & before][:, 2:].sum(axis=0)
+        counts += data[good & before][:, 2:6].sum(axis=0)
     yield Goal(f"{MUNICH}: data frames that PT1 reads in the shadow", mean(read), 13, True)
     for key, (wrong, sent), limit in (
         ("delay", counts[:2], 0.002),

@@ -28,6 +28,11 @@ from isac_rt.track.reference import TerminalState
 from isac_rt.world.swarm import Pose
 
 
+SURELY = 0.99
+"""Probability of detection from which on an active terminal without a track says that no UAV is
+there: one in three of what passive terminals alone place is a UAV, which it then misses."""
+
+
 @dataclass
 class Talk:
     """Messages on their way between terminals, and what each knew.
@@ -153,8 +158,8 @@ class Cooperation(Stateful):
     def _would_detect(
         self, link: Link, place: np.ndarray, frame: int, poses: Mapping[str, Pose]
     ) -> bool:
-        """Return whether an active terminal more likely detects a small UAV at a place than not: in
-        its field of view and range, not occluded, by the radar equation in noise."""
+        """Return whether an active terminal surely detects a small UAV at a place: in its field of
+        view and range, not occluded, by the radar equation in noise."""
         s, pose = self._setup, poses[link.rx]
         w, antennas = s.waveform, s.arrays.of(link.rx)
         distance = float(np.linalg.norm(place - pose.position))
@@ -170,7 +175,7 @@ class Cooperation(Stateful):
             w, antennas, s.scenario.receivers, sent, noise, w.num_groups, own=True
         )
         snr = (amplitude * antennas.element_gain(towards)) ** 2 * sees.cell
-        return sees.clutter_free(float(snr)) > 0.5
+        return sees.clutter_free(float(snr)) > SURELY
 
     def _observe(self, frame: int, link: Link, received: LinkResult) -> None:
         """A terminal takes down the confirmed tracks of one of its links."""
