@@ -27,7 +27,6 @@ from isac_rt.track.parts import ReportedUav, of_itself
 from isac_rt.track.reference import TerminalState
 from isac_rt.world.swarm import Pose
 
-
 SURELY = 0.99
 """Probability of detection from which on an active terminal without a track says that no UAV is
 there: one in three of what passive terminals alone place is a UAV, which it then misses."""
