@@ -166,9 +166,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str]) -> int:
     settle_process()
     warnings.showwarning = _say_warning  # type: ignore[assignment]  # fewer arguments, by *_
-    taken = logging.getLogger("isac_rt.taken")  # what was read of logs and patterns
-    taken.handlers = [logging.StreamHandler()]
-    taken.setLevel(logging.INFO)
+    notes = logging.getLogger("isac_rt.inputs")  # what was read of logs and patterns
+    notes.handlers = [logging.StreamHandler()]
+    notes.setLevel(logging.INFO)
     try:
         shut_out_working_folder()
         status = app(

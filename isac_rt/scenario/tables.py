@@ -27,7 +27,7 @@ from isac_rt.world.settings import City
 if TYPE_CHECKING:
     from isac_rt.world.city.georeference import GeoReference
 
-TAKEN = logging.getLogger("isac_rt.taken")
+INPUT_NOTES = logging.getLogger("isac_rt.inputs")
 """Says in a line what was taken of a log or a pattern; the command line prints it."""
 MAX_BYTES = 4_000_000
 MAX_ROWS = 20_000
@@ -176,7 +176,7 @@ def _flight(city: Any, folder: Path, directed: bool, path: Path) -> dict[str, An
     log = extension("flight_log")(path)
     if log is None:
         return _flight_table(city, folder, path)
-    TAKEN.info(log.note)
+    INPUT_NOTES.info(log.note)
     positions = log.positions
     if log.in_degrees:
         positions = _from_degrees(positions, _georeference(city, folder))

@@ -230,7 +230,7 @@ def warn_of_aliases(
         tx, rx = link
         limit = unambiguous_velocity(link, timetable, velocity_method, schedule)
         for name in [n for n in swarm.uavs if n != tx] if link.own else [rx]:
-            ends = [arrays.of(n) for n in link][: link.passes % 2 + 1]
+            ends = [arrays.of(end) for end in dict.fromkeys(link)]
             rates = np.array([_closing(at[tx], at[name], ends) for at in poses])
             worst = int(np.abs(rates).argmax())
             if abs(rates[worst]) > limit:

@@ -137,8 +137,8 @@ def curvature(g: Gaussian, own: Pose, transmitter: np.ndarray | None = None) -> 
     H = _segment_hessian(x[..., :3] - own.position, x[..., 3:6] - own.velocity)
     if transmitter is not None:
         H = H + _segment_hessian(x[..., :3] - transmitter[:3], x[..., 3:6] - transmitter[3:6])
-    out = np.zeros((*x.shape[:-1], 4, 4))
-    out[..., :2, :2] = np.einsum("...iab,...jba->...ij", H @ P, H @ P) / 2
+    HP, out = H @ P, np.zeros((*x.shape[:-1], 4, 4))
+    out[..., :2, :2] = np.einsum("...iab,...jba->...ij", HP, HP) / 2
     return out
 
 

@@ -15,7 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from isac_rt.scenario.tables import MAX_ROWS, TAKEN, by_aspect, number, opened, read_csv, text_of
+from isac_rt.scenario.tables import (
+    INPUT_NOTES,
+    MAX_ROWS,
+    by_aspect,
+    number,
+    opened,
+    read_csv,
+    text_of,
+)
 
 Values = NDArray[np.float64]
 DIPOLE_DBI = 2.15
@@ -144,7 +152,7 @@ def _hfss(path: Path, names: Sequence[str]) -> dict[str, Any]:
     right, up, gains = _turned(rows, columns, np.column_stack([table, table[:, 0]]))
     e, a = np.unravel_index(gains.argmax(), gains.shape)
     said = f"peak {gains[e, a]:.1f} dBi at azimuth {right[a]:g}, elevation {up[e]:g} degrees"
-    TAKEN.info("%s: %s, %s", path.name, wanted[2].split()[0], said)
+    INPUT_NOTES.info("%s: %s, %s", path.name, wanted[2].split()[0], said)
     return _absolute(right, up, gains)
 
 

@@ -95,10 +95,10 @@ class StaticClutter(TrackRule):
         an echo of one carries on: from beyond the view and along a wall they seem
         to move. Few hits confirm no track beside a surface: chance carries it from spot to spot."""
         for track in tracker.tracks:
-            early = (
-                track.id in own.tentative and sum(track.recent) < tracker.settings.confirm_window
-            )
-            track.confirmed &= not (early and self._neighbours(track) >= SURFACE)
+            few = sum(track.recent) < tracker.settings.confirm_window
+            if track.confirmed and few and track.id in own.tentative:
+                beside = self._beside(track.state.mean[None, :3])
+                track.confirmed = int(beside.sum()) < SURFACE
         fed = {t.id for t in tracker.tracks if t.detection >= 0 and self._crowd[t.detection]}
         still = {t.id for t in tracker.tracks if self.holds(t)}
         tracker.drop(still | (fed & own.tentative))
@@ -141,10 +141,10 @@ class StaticClutter(TrackRule):
         self._note(place[some := still & d.starts & ~d.is_reference], d.snr[some], time)
         return still & self.crowded(place, d.snr)
 
-    def _neighbours(self, track: Track) -> int:
-        """Count the spots beside a track."""
-        away = np.linalg.norm(self.state.spots[:, :3] - track.state.mean[:3], axis=1)
-        return int(((away > BESIDE_M[0]) & (away < BESIDE_M[1])).sum())
+    def _beside(self, places: np.ndarray) -> np.ndarray:
+        """Return which spots lie beside places (n, 3): (n, spots)."""
+        separation = np.linalg.norm(places[:, None] - self.state.spots[None, :, :3], axis=-1)
+        return np.asarray((separation > BESIDE_M[0]) & (separation < BESIDE_M[1]))
 
     def _note(self, places: np.ndarray, snr: np.ndarray, time: float) -> None:
         """Follow the spots to a frame's echoes (n, 3): each echo carries on the nearest one."""
@@ -165,9 +165,7 @@ class StaticClutter(TrackRule):
         the foot of a wall shines too."""
         spots = self.state.spots
         fleeting = spots[:, 5] <= FOUND_AGAIN * (self.state.frames - spots[:, 6])
-        separation = np.linalg.norm(places[:, None] - spots[None, :, :3], axis=-1)
-        beside = (separation > BESIDE_M[0]) & (separation < BESIDE_M[1])
-        beside &= spots[:, 3] < STANDS_OUT * snr[:, None]
+        beside = self._beside(places) & (spots[:, 3] < STANDS_OUT * snr[:, None])
         like = beside & (STANDS_OUT * spots[:, 3] > snr[:, None])
 
         def is_surface(some: np.ndarray) -> np.ndarray:

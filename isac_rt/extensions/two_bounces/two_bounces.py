@@ -58,7 +58,7 @@ class Mirrored:
 
     Attributes
     ----------
-    seen : Seen; its lengths, radii and directions are those of the ways by the mirror
+    seen : Visible; its lengths, radii and directions are those of the ways by the mirror
     phasor : (K,) complex64 of modulus 1, what the mirror does to the phase
     mirror : Mirror
     before : whether the mirror comes before the scatterer

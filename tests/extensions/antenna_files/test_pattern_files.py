@@ -126,7 +126,7 @@ def hfss(unit="deg", column="dB(GainTotal) []", theta=None, phi=None, step=2.0):
 def test_hfss_tables_turn_into_the_bodys_frame(tmp_path, stated, caplog):
     """A lobe about an axis of all three signs, in front and behind. Planted bug: X of HFSS taken to
     the right; Phi behind a negative Theta not turned by 180 degrees."""
-    with caplog.at_level("INFO", "isac_rt.taken"):
+    with caplog.at_level("INFO", "isac_rt.inputs"):
         scenario = read(tmp_path, "field.csv", hfss(**stated))
     ways = np.random.default_rng(4).uniform([-180, -80], [180, 80], (200, 2))
     ways = ways[directions(ways) @ AXIS > -0.7]

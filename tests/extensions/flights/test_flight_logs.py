@@ -85,7 +85,7 @@ def test_px4_local_positions(tmp_path, caplog):
     left out. Planted bug: x taken as east; z upwards; the flag not asked for."""
     pytest.importorskip("pyulog")
     ulog(tmp_path / "log.ulg", ("vehicle_local_position", LOCAL, local_rows(lost=(17, 18))))
-    with caplog.at_level("INFO", "isac_rt.taken"):
+    with caplog.at_level("INFO", "isac_rt.inputs"):
         check(fly(tmp_path, "log.ulg"))
     assert "log.ulg: vehicle_local_position, 39 positions, 4.0 s" in caplog.text
     check(fly(tmp_path, "log.ulg#vehicle_local_position"))
@@ -134,7 +134,7 @@ def test_px4_attitudes(tmp_path, caplog):
     fields = [("uint64_t", "timestamp"), ("float[4]", "q")]
     place = "vehicle_local_position", LOCAL, local_rows()
     ulog(tmp_path / "log.ulg", place, ("vehicle_attitude", fields, rows))
-    with caplog.at_level("INFO", "isac_rt.taken"):
+    with caplog.at_level("INFO", "isac_rt.inputs"):
         uav = fly(tmp_path, "log.ulg")
     check(uav)
     check_attitude(uav)
@@ -149,7 +149,7 @@ def test_a_long_log_is_thinned(tmp_path, caplog):
     pytest.importorskip("pyulog")
     times = np.arange(12_000) * 4 / 12_000
     ulog(tmp_path / "log.ulg", ("vehicle_local_position", LOCAL, local_rows(times)))
-    with caplog.at_level("INFO", "isac_rt.taken"):
+    with caplog.at_level("INFO", "isac_rt.inputs"):
         uav = fly(tmp_path, "log.ulg")
     assert len(uav.waypoints) == 4000
     assert "12000 positions, 4.0 s, one of 3 is taken" in caplog.text
@@ -283,7 +283,7 @@ def test_ros_topics(tmp_path, kind, make, caplog):
     out. Planted bug: the time of arrival; the status not asked for."""
     town(tmp_path)
     bag(tmp_path / "bag", {"/uav/at": (kind, make, TIMES)})
-    with caplog.at_level("INFO", "isac_rt.taken"):
+    with caplog.at_level("INFO", "isac_rt.inputs"):
         check(fly(tmp_path, "bag", CITY))
     assert f"bag: /uav/at, {41 - 2 * (make is fix)} positions, 4.0 s" in caplog.text
 
@@ -341,7 +341,7 @@ def test_sumos_vehicles(tmp_path, caplog):
     """Times from the file's first step, which all vehicles share. Planted bug: from the vehicle's
     first; the bus's places among the car's."""
     sumo(tmp_path / "fcd.xml")
-    with caplog.at_level("INFO", "isac_rt.taken"):
+    with caplog.at_level("INFO", "isac_rt.inputs"):
         uav = fly(tmp_path, "fcd.xml#car.0")
     assert uav.waypoints[0].time_s == pytest.approx(1.0)
     assert "fcd.xml: car.0, 31 positions, 3.0 s" in caplog.text
