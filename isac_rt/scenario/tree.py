@@ -468,15 +468,15 @@ class Scenario(Node):
     def _hardware_problems(self) -> Iterator[Problem]:
         """List what terminals with hardware of their own must share."""
         for name, uav in self.swarm.items():
-            count = self.num_tx if uav.array is None else uav.array.num_tx
-            if count != self.num_tx:
+            array = uav.array or self.array
+            if array.num_tx != self.num_tx:
                 said = (
-                    f"{count} transmit elements, and array has {self.num_tx}: all terminals share "
-                    "the order in which these take turns; state as many"
+                    f"{array.num_tx} transmit elements, and array has {self.num_tx}: all terminals "
+                    "share the order in which these take turns; state as many"
                 )
                 yield Problem((("swarm", name, "array"), ("array",)), said)
             for key in ("schedule", "fall_back"):
-                if uav.array is not None and getattr(uav.array, key) != getattr(self.array, key):
+                if getattr(array, key) != getattr(self.array, key):
                     said = f"all terminals share array.{key}; leave it out"
                     yield Problem((("swarm", name, "array", key), ("array", key)), said)
             if uav.noise is not None and uav.noise.model != self.noise.model:
@@ -506,16 +506,17 @@ class Scenario(Node):
             yield Problem((("radio", "scheme"), ("radio", "calibration")), said)
 
     def _front_end_problems(self) -> Iterator[Problem]:
-        stated: dict[Key, FrontEnd] = {("radio", "front_end"): self.radio.front_end}
-        stated |= {
-            ("swarm", name, "front_end"): uav.front_end
-            for name, uav in self.swarm.items()
-            if uav.front_end is not None
-        }
-        for key, one in stated.items():
-            array = (key[0] == "swarm" and self.swarm[str(key[1])].array) or self.array
-            yield from self._element_problems((*key, "transmit"), one.transmit, self.num_tx)
-            yield from self._element_problems((*key, "receive"), one.receive, array.num_rx)
+        common: Key = ("radio", "front_end")
+        stated: list[tuple[Key, FrontEnd, Key, Array]]
+        stated = [(common, self.radio.front_end, ("array",), self.array)]
+        for name, uav in self.swarm.items():
+            key = common if uav.front_end is None else ("swarm", name, "front_end")
+            at: Key = ("array",) if uav.array is None else ("swarm", name, "array")
+            if uav.role != "target":
+                stated.append((key, self.front_end_of(name), at, uav.array or self.array))
+        for key, one, at, array in stated:
+            yield from self._element_problems((*key, "transmit"), one.transmit, at, self.num_tx)
+            yield from self._element_problems((*key, "receive"), one.receive, at, array.num_rx)
             sent = one.transmit_response
             if sent.differs and self.radio.bands(self.num_tx) > 1:
                 said = (
@@ -534,11 +535,12 @@ class Scenario(Node):
                 yield Problem(((*key, *powers[0]), ("noise", "model")), said)
 
     @staticmethod
-    def _element_problems(key: Key, elements: Elements, size: int) -> Iterator[Problem]:
+    def _element_problems(key: Key, elements: Elements, array: Key, size: int) -> Iterator[Problem]:
         for name, count in elements.counts():
             if count != size:
-                said = f"{count} values for {size} {key[-1]} elements; state one of each element"
-                yield Problem(((*key, name), ("array",)), said)
+                of = f"{size} {key[-1]} elements of {dotted(array)}"
+                said = f"{count} values for {of}; state one of each"
+                yield Problem(((*key, name), array), said)
                 return
 
     def first_blocks(self) -> dict[str, int]:

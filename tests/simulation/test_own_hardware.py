@@ -135,6 +135,19 @@ def test_a_stated_common_array_changes_no_bit():
     assert one.equals(other)
 
 
+def test_elements_of_a_common_front_end_fit_every_array():
+    """Four gains for the common array of four receive elements, and a terminal of two. Bug: only
+    the terminal's own front end is compared with its array."""
+    tree = changed()
+    tree["radio"] = TREE["radio"] | {"front_end": {"receive": {"gain_db": [0.1, 0.2, 0.3, 0.4]}}}
+    said = r"radio\.front_end\.receive\.gain_db.*4 values for 2 receive elements"
+    with pytest.raises(ScenarioError, match=said) as problem:
+        irt.load(tree)
+    assert str(problem.value).count("values for") == 1
+    tree["swarm"]["PT"]["front_end"] = {"receive": {"gain_db": [0.1, 0.2]}}
+    irt.load(tree)
+
+
 @pytest.mark.parametrize(
     ("uav", "said"),
     [
