@@ -247,18 +247,19 @@ def _whitened_share(
 
 
 def _beside_sight(own: int, paths: PathSet, waveform: Waveform, channels: Channels) -> float:
-    """Return the share of a path's energy that is left once the strongest line of sight is taken
-    out, as a receiver must that does not know its amplitude by transmit antenna, delay, delay rate
-    and direction of arrival: 1 less the projection on it and on its four derivatives.
+    """Return the share of a path's energy that is left after the strongest line of sight, unless it
+    is the path itself, has been fitted and subtracted with unknown amplitudes by transmit antenna,
+    delay, delay rate and direction: 1 less the projection on it and on its four derivatives.
 
     A frame's samples fill delay, Doppler and receivers evenly, so that the inner products factor:
     over an axis of unit length a tone x cells off has sinc(x) along the constant and
     (sinc(x) - cos(pi x)) / (2 pi x) along the line j n, of norm 12^-1/2.
     """
     los_paths = np.flatnonzero(paths.kind == PathKind.LINE_OF_SIGHT)
-    if not los_paths.size:
+    los = int(los_paths[np.argmax(paths.power[los_paths])]) if los_paths.size else own
+    if los == own:
         return 1.0
-    w, los = waveform, los_paths[np.argmax(paths.power[los_paths])]
+    w = waveform
     both, middle = np.array([own, los]), np.zeros(1)
     beats = w.beat_cells(paths.delay[both, None], paths.delay_rate[both, None], middle)[:, 0]
     rate = paths.delay_rate[own] - paths.delay_rate[los]

@@ -34,6 +34,7 @@ from isac_rt.views.style import (
     labelled,
     link_name,
     moment,
+    range_words,
     words,
 )
 from isac_rt.world.city.mesh import CityMesh
@@ -154,13 +155,8 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
         if uav == dataset.receiver.values[observer] or not here("in_view")[:, u].any():
             continue
         colour, seen = colour_of(u), here("in_view")[:, u]
-        ax.plot(
-            t,
-            np.where(seen, here(f"truth_{name}")[:, u] * scale, np.nan),
-            color=colour,
-            lw=0.9,
-            label=str(uav),
-        )
+        truth = np.where(seen, here(f"truth_{name}")[:, u] * scale, np.nan)
+        ax.plot(t, truth, color=colour, lw=0.9, label=str(uav))
         ax.plot(t, here(f"detected_{name}")[:, u] * scale, ".", color=colour, ms=4, alpha=0.7)
         ax.plot(t, here(f"tracked_{name}")[:, u] * scale, color=colour, lw=3, alpha=0.45)
         _shade(ax, t, here("occluded")[:, u] & seen, colour)
@@ -173,8 +169,9 @@ def over_time(ax: Axes, dataset: xr.Dataset, observer: int, name: str) -> Axes:
         forms["occluded"] = {"marker": "s", "ms": 7, "mew": 0, "ls": "none", "alpha": 0.2}
     for label, style in forms.items():
         ax.plot([], [], color="#606060", label=label, **style)
-    title = link_name(dataset, observer) if name == "range" else ""
-    return labelled(ax, "time [s]", f"{name} [{unit}]", title)
+    first = name == "range"
+    y = range_words(dataset, observer) if first else f"{name} [{unit}]"
+    return labelled(ax, "time [s]", y, link_name(dataset, observer) if first else "")
 
 
 def _processed(dataset: xr.Dataset, observer: int) -> Callable[[str], np.ndarray]:
@@ -268,15 +265,8 @@ def decoding(ax: Axes, dataset: xr.Dataset, observer: int) -> Axes:
             out=np.full(len(t), np.nan),
             where=total[:, s] > 0,
         )
-        ax.plot(
-            t,
-            rate,
-            f"{mark}-",
-            ms=3,
-            lw=0.8,
-            color=colour,
-            label=f"{'delay' if s == 0 else 'DPSK'} symbols",
-        )
+        label = f"{'delay' if s == 0 else 'DPSK'} symbols"
+        ax.plot(t, rate, f"{mark}-", ms=3, lw=0.8, color=colour, label=label)
     data = total[:, 0] > 0
     lost = data & ~dataset.decoded.values[:, observer]
     if lost.any():

@@ -14,6 +14,7 @@ from isac_rt.views.style import (
     labelled,
     link_name,
     moment,
+    range_words,
     words,
 )
 
@@ -58,11 +59,10 @@ def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -
     ax.plot(x, y, "o", ms=11, mfc="none", mec="white", mew=1.2, ls="none", label="UAV (truth)")
     xlim, ylim = map_limits(dataset, snapshot, observer)
     ax.set(xlim=xlim, ylim=ylim)
-    own = dataset.transmitter.values[observer] == dataset.receiver.values[observer]
     return labelled(
         ax,
         "range rate [m/s]",
-        "range [m]" if own else "path length [m]",
+        range_words(dataset, observer),
         f"{link_name(dataset, observer)}, frame {number}",
         frameon=True,
         facecolor="#303030",

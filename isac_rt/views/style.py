@@ -71,6 +71,12 @@ def link_name(dataset: xr.Dataset, observer: int) -> str:
     return f"{dataset.transmitter.values[observer]} to {dataset.receiver.values[observer]}"
 
 
+def range_words(dataset: xr.Dataset, observer: int) -> str:
+    """Return the axis label of an observer's ranges: those of echoes are one-way."""
+    own = dataset.transmitter.values[observer] == dataset.receiver.values[observer]
+    return "range [m]" if own else "path length [m]"
+
+
 def moment(dataset: xr.Dataset, snapshot: int) -> tuple[int, int]:
     """Index of a snapshot's frame, and the frame's number."""
     frame = int(dataset.snapshot_frame.values[snapshot])

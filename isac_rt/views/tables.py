@@ -160,11 +160,12 @@ def hit_table(summary: Mapping[str, Any], group: str) -> Table:
 def bound_table(summary: Mapping[str, Any], group: str) -> Table:
     """Tabulate the share of ``targets`` or ``terminals`` found by link, its bounds, and SNR."""
     titles = ("Matched filter", "Noise only", "Known clutter", "Found", "False alarms")
-    losses = ("SNR [dB]", "Windows [dB]", "Off grid [dB]", "Clutter [dB]")
+    losses = ("SNR [dB]", "Windows [dB]", "Straddling [dB]", "Clutter [dB]")
     rows = []
     for link, s, part in _parts(summary, group):
         found = *part["bounds"].values(), part["hit_rate"], s["false_per_frame"]
-        rows.append((link, *map(number, (*found, *part["snr_db"].values()))))
+        levels = (None if level is None else round(level, 2) for level in part["snr_db"].values())
+        rows.append((link, *map(number, (*found, *levels))))
     return Table((f"Detection of {group}", *titles, *losses), rows)
 
 

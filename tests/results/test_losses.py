@@ -60,10 +60,10 @@ def echo(length, rate, amplitude, others=(), u=0.0):
     )
 
 
-def chance_of(paths, sees=SEES, waveform=W) -> Chance:
+def chance_of(paths, sees=SEES, waveform=W, own=0) -> Chance:
     wavenumber = 2 * np.pi * float(waveform.carrier()) / SPEED_OF_LIGHT
     channels = Channels(ANTENNAS, wavenumber, Pose.at_rest(), Pose.at_rest())
-    return Chance.of(0, paths, MapPositions.of(paths, waveform, 2), waveform, sees, channels)
+    return Chance.of(own, paths, MapPositions.of(paths, waveform, 2), waveform, sees, channels)
 
 
 @pytest.mark.parametrize(("bins", "rows"), [(3.0, 11.0), (3.5, 11.0), (-2.3, 17.4)])
@@ -243,7 +243,7 @@ def test_energy_of_an_echo_beside_the_line_of_sight(cells, bins, u):
     """Samples of the echo, for each transmit antenna, less their projection on those of the line of
     sight and on what these change by with length, rate and direction. 0.01: slow time of an antenna
     is drawn at random within three slots. Planted bugs: the direction's derivatives left out; the
-    line's norm forgotten; departures for arrivals."""
+    line's norm forgotten; departures for arrivals; the line of sight subtracted from itself."""
     w, schedule, _ = frame(waveform=W)
     cell, bin_ = w.range_cell(1), w.velocity_cell(1)
     first = Path(11.0 * cell, 3.0 * bin_, 1.0, (0.12, -0.07), (0.3, 0.1))
@@ -290,6 +290,8 @@ def test_energy_of_an_echo_beside_the_line_of_sight(cells, bins, u):
     )
     found = chance_of(paths)
     assert found.whitened / found.channels == pytest.approx(left / total, abs=0.01)
+    itself = chance_of(paths, own=1)
+    assert itself.whitened == itself.channels
 
 
 def test_background_is_the_greater_of_the_two_sides():
