@@ -341,14 +341,13 @@ class Tracker(Stateful):
     def _one_reading_each(self) -> None:
         """Take back the confirmation of tracks in this frame while another reading of their first
         detection has as many hits."""
+        hits: dict[int, list[int]] = {}
+        for track in self.tracks:
+            hits.setdefault(track.first_id, []).append(sum(track.recent))
         for track in self.tracks:
             if track.age < self.settings.confirm_window and track.first_id >= 0:
-                hits = sum(track.recent)
-                track.confirmed &= not any(
-                    other.first_id == track.first_id and sum(other.recent) >= hits
-                    for other in self.tracks
-                    if other is not track
-                )
+                most, own = hits[track.first_id], sum(track.recent)
+                track.confirmed &= sum(count >= own for count in most) == 1
 
     def _live(self, track: Track, hit: bool, active: bool) -> None:
         s = self.settings
