@@ -239,7 +239,7 @@ MAX_LINES = {
     "kernels": 4001,
     "frame": 2822,
     "world": 3685,
-    "propagation": 4705,
+    "propagation": 4706,
     "signal": 815,
     "receive": 6045,
     "track": 1926,

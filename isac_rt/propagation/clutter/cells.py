@@ -195,9 +195,8 @@ def leaves(
         radius = np.sqrt(((corners - middle) ** 2).sum(axis=1).max(axis=0))
         finer = np.where(FINER * area > smallest, np.minimum(FINER * area / per_metre, near), 0)
         needed = np.maximum(np.where(area > smallest, area / per_metre, 0), finer)
-        farthest_asked = (needed + radius).max(initial=0)
-        distance = tree.query(middle.T, distance_upper_bound=farthest_asked)[0] - radius
-        large = np.maximum(distance, 0) < needed
+        reach = (needed + radius).max(initial=0)
+        large = np.maximum(tree.query(middle.T, distance_upper_bound=reach)[0] - radius, 0) < needed
         done.append(_some(cells, ~large))
         count += len(done[-1][0])
         row, code, area, corners = _some(cells, large)
