@@ -24,7 +24,7 @@ from isac_rt.settings import Key, Node, Problem, dotted
 
 Tree = typing.TypeVar("Tree", bound=Node)
 
-_OF_A_TYPE = re.compile(r"\[key\]$|function-\w+\[\w+\(\)|literal\[")
+_OF_A_TYPE = re.compile(r"\[key\]$|function-\w+\[\w+\(\)|literal\[|constrained-str$")
 """What pydantic puts between keys: of a mapping's key, and of each type that a value may have."""
 MAX_MESSAGES = 10
 MAX_BYTES = 4_000_000

@@ -23,9 +23,12 @@ def mixed_chirps(w, links, rx_pose, rx_antennas, start_time, block=0):
     longest = ld(w.sampling_rate) * window / (ld(w.bandwidth) - 2 * ld(w.sampling_rate))
     chirp = window + 2 * longest
     slope = ld(w.bandwidth) / chirp
-    slot = chirp + 2 * w.num_tx * longest
+    slot, begin = chirp + 2 * w.num_tx * longest, 2 * longest
+    if w.sweep is not None:  # timing of a data sheet
+        slope, slot, begin = ld(w.sweep.slope), ld(w.sweep.repetition), ld(w.sweep.adc_start)
+        longest = ld(w.sampling_rate) / slope
     frame = w.num_chirps * slot
-    fast = np.arange(w.num_samples).astype(ld) * period + 2 * longest
+    fast = np.arange(w.num_samples).astype(ld) * period + begin
 
     def oscillator(since):  # phase of a chirp in cycles
         return ld(w.carrier_frequency) * since + slope * since * since / 2

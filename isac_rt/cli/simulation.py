@@ -322,7 +322,8 @@ def paths(
         from isac_rt.views.interchange import write_ledger
 
         found = trace(loaded, frame)
-        write_ledger(found, out, loaded.radio.carrier_hz, provenance(loaded))
+        carriers = {n: (u.radio or loaded.radio).carrier_hz for n, u in loaded.swarm.items()}
+        write_ledger(found, out, carriers, provenance(loaded))
     kinds = next(iter(found.values())).counts() if found else ()
     say_table(
         ["link", *(kind.replace("_", " ") for kind in kinds)],

@@ -4,7 +4,7 @@ All of it public."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -35,6 +35,7 @@ class Timetable:
     role_changes : in rising order of their frames
     refused : links that were not established before the data
     begins : frame with which the acquisition frames of the start begin
+    own : timetables of plain radars whose chirp differs from `waveform`, by name
     """
 
     waveform: Waveform
@@ -49,16 +50,24 @@ class Timetable:
     role_changes: tuple[RoleChange, ...] = ()
     refused: frozenset[Link] = frozenset()
     begins: int = 0
+    own: Mapping[str, Timetable] = field(default_factory=dict)
+
+    def of(self, name: str) -> Timetable:
+        """Return the timetable of a terminal's chirp."""
+        return self.own.get(name, self)
 
     def start_time(self, frame: int, active: str | None = None) -> float:
         """Start of a frame's first slot, or of the first chirp of an active terminal, whose block
         may start later in the slot [s]."""
+        if active is not None and active in self.own:
+            return self.own[active].start_time(frame, active)
         block = 0 if active is None else self.first_block(active, frame)
         return frame * self.interval + block * self.waveform.group_spacing
 
     def epoch(self, frame: int, active: str | None = None) -> float:
         """Middle of a frame, or of the chirps of an active terminal [s]."""
-        return self.start_time(frame, active) + self.waveform.frame_duration / 2
+        waveform = self.waveform if active is None else self.of(active).waveform
+        return self.start_time(frame, active) + waveform.frame_duration / 2
 
     def modulated(self, frame: int) -> bool:
         """Return whether a frame carries data: all but the periodic pilots and the acquisition
@@ -154,7 +163,7 @@ class Timetable:
         """Return the payload of an active terminal's chirps in a frame; `schedule`: if it is
         another than the usual one. The bits are the same."""
         if not self.modulated(frame):
-            return unmodulated(self.waveform)
+            return unmodulated(self.of(active).waveform)
         rng = generator(self.seed, "payload", active, frame)
         usual = self.schedule if schedule is None else schedule
         return random_payload(self.waveform, usual, self.modulation.dpsk_order, rng)

@@ -151,7 +151,7 @@ def dataset_of(
     import pandas as pd
     import xarray as xr  # as dear as a frame, and not needed before the last
 
-    w, labels = timetable.waveform, list(timetable.labels.values())
+    labels = list(timetable.labels.values())
     uavs, roles = list(timetable.first_roles), list(timetable.first_roles.values())
     out: dict[str, xr.Variable] = {}
 
@@ -202,14 +202,19 @@ def dataset_of(
     _put_paths(put, found["path"])
     _put_maps(put, found["maps"], len(labels))
     _put_fused(put, tables, sizes)
-    numbers = {
-        "carrier_hz": w.carrier_frequency,
-        "effective_carrier_hz": w.effective_carrier,
-        "frame_duration_s": w.frame_duration,
-        "frame_interval_s": timetable.interval,
-        "range_cell_m": w.range_cell(1),
-        "velocity_cell_mps": w.velocity_cell(1),
-    }
+    numbers = {"frame_interval_s": timetable.interval}
+    waveforms = [timetable.of(link.tx).waveform for link in timetable.labels]
+    for name, unit, values in (
+        ("carrier_hz", "Hz", [w.carrier_frequency for w in waveforms]),
+        ("effective_carrier_hz", "Hz", [w.effective_carrier for w in waveforms]),
+        ("frame_duration_s", "s", [w.frame_duration for w in waveforms]),
+        ("range_cell_m", "m", [w.range_cell(1) for w in waveforms]),
+        ("velocity_cell_mps", "m s-1", [w.velocity_cell(1) for w in waveforms]),
+    ):
+        if timetable.own:
+            put(name, ["observer"], values, unit, "of the observer's chirp, of one pass")
+        else:
+            numbers[name] = values[0]
     return xr.Dataset(out, attrs=numbers)
 
 

@@ -92,7 +92,7 @@ class SwarmScorer(Stateful):
     def __init__(self, timetable: Timetable, arrays: Arrays) -> None:
         self._timetable = timetable
         self._resolutions = {
-            link: Resolution.of(timetable.waveform, arrays.at(link), 2 if link.own else 1)
+            link: Resolution.of(timetable.of(link.tx).waveform, arrays.at(link), link.passes)
             for link in timetable.all_links
         }
         self._origins = [str(link) for link in timetable.labels]

@@ -50,10 +50,11 @@ def doubts(scenario: Scenario) -> Iterator[Problem]:
 
 
 def _doubts_of_keys(scenario: Scenario) -> Iterator[Problem]:
-    for (a, first), (b, second) in combinations(scenario.first_blocks().items(), 2):
-        if abs(first - second) < scenario.radio.groups:
-            said = f"{b} and {a} send in the same resource blocks; shall they collide?"
-            yield Problem((("swarm", b, "resource_block"),), said)
+    for one in scenario.by_chirp():
+        for (a, first), (b, second) in combinations(one.first_blocks().items(), 2):
+            if abs(first - second) < one.radio.groups:
+                said = f"{b} and {a} send in the same resource blocks; shall they collide?"
+                yield Problem((("swarm", b, "resource_block"),), said)
     for key, (low, high, unit) in PLAUSIBLE.items():
         value: object = scenario
         for name in key:

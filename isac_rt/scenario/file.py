@@ -82,15 +82,19 @@ def load(
 
 def _missing_files(tree: Mapping[str, Any], folder: Path) -> Iterator[Problem]:
     """List files that a tree names and that are none."""
-    for node, key, make in (
-        ("city", "file", "the path is relative to the scenario's folder"),
-        ("radio", "calibration", "make one with isac-rt calibrate --out {}"),
-    ):
-        here = tree.get(node)
-        name = here.get(key) if isinstance(here, dict) else None
-        if isinstance(name, str) and not os.path.isfile(folder / name):
-            said = f"no such file in {folder}; {make.format(folder / name)}"
-            yield Problem(((node, key),), said)
+    swarm = tree.get("swarm")
+    uavs = swarm.items() if isinstance(swarm, dict) else ()
+    terminals = [(("swarm", name), uav) for name, uav in uavs if isinstance(uav, dict)]
+    for at, above in [((), tree), *terminals]:
+        for node, key, make in (
+            ("city", "file", "the path is relative to the scenario's folder"),
+            ("radio", "calibration", "make one with isac-rt calibrate --out {}"),
+        ):
+            here = above.get(node)
+            name = here.get(key) if isinstance(here, dict) else None
+            if isinstance(name, str) and not os.path.isfile(folder / name):
+                said = f"no such file in {folder}; {make.format(folder / name)}"
+                yield Problem(((*at, node, key),), said)
 
 
 def folded_tree(scenario: Scenario, keys: Iterable[str]) -> dict[str, Any]:
@@ -165,7 +169,7 @@ def to_yaml(scenario: Scenario, folder: str | os.PathLike[str] | None = None) ->
     data = plain_tree(scenario)
     if folder is not None and scenario.city is not None and scenario.city.file is not None:
         data["city"]["file"] = os.path.relpath(scenario.city_path(), folder)
-    board = scenario.calibration_path()
-    if folder is not None and board is not None:
-        data["radio"]["calibration"] = os.path.relpath(board, folder)
+    for radio in (data["radio"], *(u["radio"] for u in data["swarm"].values() if "radio" in u)):
+        if folder is not None and radio.get("calibration") is not None:
+            radio["calibration"] = os.path.relpath(scenario.folder / radio["calibration"], folder)
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)

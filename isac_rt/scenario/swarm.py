@@ -9,11 +9,13 @@ from typing import Any
 
 from isac_rt.frame.front_end import FrontEnd
 from isac_rt.frame.settings import Array, Noise
+from isac_rt.scenario.radio import Radio
+from isac_rt.scenario.sensors import BoardFile, Sensor
 from isac_rt.settings import Problem
 from isac_rt.world import settings
 from isac_rt.world.settings import Formation, Waypoint
 
-HARDWARE = ("front_end", "array", "noise")
+HARDWARE = ("front_end", "sensor", "radio", "array", "noise")
 """Keys of a terminal's hardware, which a target has none of."""
 
 
@@ -23,9 +25,15 @@ class Uav(settings.Uav):
 
     front_end: FrontEnd | None = None
     """This terminal's hardware in place of `radio.front_end`. null, the default: that of all."""
+    sensor: Sensor | BoardFile | None = None
+    """This terminal's board in `mode: fmcw`, one of those of `sensor`: it fills in the three keys
+    below. null, the default: that of all."""
+    radio: Radio | None = None
+    """This terminal's chirp in `mode: fmcw`: what is stated overrides `radio`. Radars of different
+    chirps do not receive each other. null, the default: that of all."""
     array: Array | None = None
     """This terminal's antennas: what is stated overrides `array`. As many transmit elements as
-    there. null, the default: those of all."""
+    there, but beside a `radio`. null, the default: those of all."""
     noise: Noise | None = None
     """This terminal's transmit power, noise figure or SNR: what is stated overrides `noise`. null,
     the default: those of all."""

@@ -312,7 +312,13 @@ def with_tables(
     ------
     TableError  If a file is none, is not readable as a table, or numbers are stated beside it.
     """
-    out = _with_board(tree, folder, faults)
+    out = _with_board(tree, folder, (), faults)
+    swarm = out.get("swarm")
+    for name, uav in swarm.items() if isinstance(swarm, dict) else ():
+        if isinstance(uav, dict):
+            own = _with_board(uav, folder, ("swarm", name), faults)
+            if own is not uav:
+                out = {**out, "swarm": {**out["swarm"], name: own}}
     for key, name, reader in _tables_of(tree, folder):
         here = _at(out, key)
         file = here.get(name) if isinstance(here, dict) else None
@@ -336,9 +342,11 @@ def with_tables(
     return out
 
 
-def _with_board(tree: dict[str, Any], folder: Path, faults: list[Problem] | None) -> dict[str, Any]:
-    """A tree whose `sensor` names a board's configuration, with what that says under the keys that
-    are stated."""
+def _with_board(
+    tree: dict[str, Any], folder: Path, at: Key, faults: list[Problem] | None
+) -> dict[str, Any]:
+    """A tree, or the terminal `at` which it stands, whose `sensor` names a board's configuration,
+    with what that says under the keys that are stated."""
     file = tree.get("sensor")
     if not isinstance(file, str) or Path(file).suffix not in BOARD_FILES:
         return tree
@@ -346,12 +354,13 @@ def _with_board(tree: dict[str, Any], folder: Path, faults: list[Problem] | None
         board = read_board(folder / file)
     except BoardFileError as problem:
         if faults is None:
-            raise TableError(("sensor",), str(problem)) from None
-        faults.append(Problem((("sensor",),), str(problem)))
+            raise TableError((*at, "sensor"), str(problem)) from None
+        faults.append(Problem(((*at, "sensor"),), str(problem)))
         return {key: value for key, value in tree.items() if key != "sensor"}
     out = completed(copy.deepcopy(tree), board.scenario())
     del out["sensor"]
-    out.setdefault("frame_interval_s", board.period)
+    if not at:
+        out.setdefault("frame_interval_s", board.period)
     return out
 
 

@@ -12,7 +12,7 @@ import inspect
 import itertools
 import math
 import textwrap
-from collections.abc import Callable, Iterator, Set
+from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -34,7 +34,7 @@ from isac_rt.receive.settings import Receivers
 from isac_rt.scenario.presets import Preset, ReceiverSet, with_preset
 from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.sensors import SENSORS, BoardFile, Sensor, with_sensor
-from isac_rt.scenario.swarm import Uav, formations, unfolded
+from isac_rt.scenario.swarm import HARDWARE, Uav, formations, unfolded
 from isac_rt.settings import Key, Name, Node, Positive, Problem, Seed, dotted
 from isac_rt.signal.settings import Accuracy
 from isac_rt.track.settings import Belief, Tracking
@@ -168,6 +168,37 @@ class Scenario(Node):
         """The file of radio.calibration, found from the scenario's folder; None without one."""
         return None if self.radio.calibration is None else self.folder / self.radio.calibration
 
+    def by_chirp(self) -> tuple[Scenario, ...]:
+        """The scenario as the radars of each chirp have it for themselves: their `radio` is that of
+        all, the other radars are targets. The common chirp comes first; where all have it, this
+        very scenario is returned."""
+        radars = [n for n, u in self.swarm.items() if u.role == "active"]
+        if self.radio.mode != "fmcw" or not radars:
+            return (self,)
+        chirps = [(self.radio, self.num_tx), *map(self._chirp_of, radars)]
+        different = [c for i, c in enumerate(chirps) if c not in chirps[:i]]
+        groups = [[n for n in radars if self._chirp_of(n) == chirp] for chirp in different]
+        if len(groups[0]) == len(radars):
+            return (self,)
+        return tuple(self._alone(names) for names in groups if names)
+
+    def _chirp_of(self, name: str) -> tuple[Radio, int]:
+        """Return the radio and the number of transmit elements of a terminal."""
+        uav = self.swarm[name]
+        return uav.radio or self.radio, (uav.array or self.array).num_tx
+
+    def _alone(self, names: Sequence[str]) -> Scenario:
+        """Return the scenario of some radars of one chirp, the other radars as targets."""
+        first, swarm = self.swarm[names[0]], dict[str, Uav]()
+        for name, uav in self.swarm.items():
+            hidden = ("sensor", "radio") if name in names or uav.role != "active" else HARDWARE
+            role = uav.role if name in names else "target"
+            swarm[name] = uav.model_copy(update=dict.fromkeys(hidden) | {"role": role})
+        shared = {"radio": first.radio or self.radio, "array": first.array or self.array}
+        interval = self.frame_interval_s or self.frame_duration_s
+        alone = {"sensor": None, "swarm": swarm, "frame_interval_s": interval}
+        return self.model_copy(update=shared | alone)
+
     @property
     def num_tx(self) -> int:
         """L_tx, transmit elements."""
@@ -186,8 +217,11 @@ class Scenario(Node):
 
     @property
     def frame_duration_s(self) -> float:
-        """P T-, the frame without the pause that `frame_interval_s` may leave after it."""
-        return self.radio.chirps_per_frame * self.radio.times(self.num_tx).slot
+        """P T-, the longest terminal's frame without the pause that `frame_interval_s` may leave
+        after it."""
+        radars = [name for name, uav in self.swarm.items() if uav.role == "active"]
+        chirps = [*map(self._chirp_of, radars)] or [(self.radio, self.num_tx)]
+        return max(radio.chirps_per_frame * radio.times(num_tx).slot for radio, num_tx in chirps)
 
     @property
     def flight_duration_s(self) -> float:
@@ -219,6 +253,7 @@ class Scenario(Node):
             self._initiation_problems,
             self._calibration_problems,
             self._hardware_problems,
+            self._own_chirp_problems,
             self._front_end_problems,
             self._self_calibration_problems,
             self._set_problems,
@@ -441,7 +476,49 @@ class Scenario(Node):
                 )
                 yield Problem((stream, ("radio", "groups")), said)
 
+    def _own_chirp_problems(self) -> Iterator[Problem]:
+        """List what terminals cannot have of a chirp of their own."""
+        for name, uav in self.swarm.items():
+            for key in ("sensor", "radio"):
+                if getattr(uav, key) is not None and self.radio.mode == "isac":
+                    said = "terminals that send data share the chirp; leave it out, or set "
+                    keys = ("swarm", name, key), ("radio", "mode")
+                    yield Problem(keys, f"{said}radio.mode: fmcw for all")
+                    break
+        modes = {name: uav.radio.mode for name, uav in self.swarm.items() if uav.radio is not None}
+        for name, mode in modes.items():
+            if self.radio.mode == "fmcw" != mode:
+                said = "is isac, and radio.mode of all terminals is fmcw; leave it out"
+                yield Problem((("swarm", name, "radio", "mode"), ("radio", "mode")), said)
+        if "isac" in modes.values():
+            return
+        for one in self.by_chirp():
+            if one is not self:
+                yield from self._problems_alone(one)
+
+    def _problems_alone(self, alone: Scenario) -> Iterator[Problem]:
+        """List what is wrong with the radars of one chirp, by the keys under which they state
+        it."""
+        name = next(n for n, u in alone.swarm.items() if u.role == "active")
+        for rule in (
+            alone._slot_problems,
+            alone._fmcw_array_problems,
+            alone._fmcw_receiver_problems,
+            alone._block_problems,
+            alone._self_calibration_problems,
+            alone._calibration_problems,
+            alone._front_end_problems,
+        ):
+            for problem in rule():
+                keys = tuple(
+                    ("swarm", name, *key) if key[0] in ("radio", "array") else key
+                    for key in problem.keys
+                )
+                yield Problem(keys, problem.text)
+
     def _block_problems(self) -> Iterator[Problem]:
+        if self.by_chirp()[0] is not self:
+            return
         r = self.radio
         limit = r.num_blocks(self.num_tx)
         for name, first in self.first_blocks().items():
@@ -459,7 +536,8 @@ class Scenario(Node):
 
     def front_end_of(self, name: str) -> FrontEnd:
         """The hardware of a terminal: its own, or that of all."""
-        return self.swarm[name].front_end or self.radio.front_end
+        uav = self.swarm[name]
+        return uav.front_end or (uav.radio or self.radio).front_end
 
     def noise_of(self, name: str) -> Noise:
         """The transmit power and the noise of a terminal: its own, or those of all."""
@@ -469,7 +547,7 @@ class Scenario(Node):
         """List what terminals with hardware of their own must share."""
         for name, uav in self.swarm.items():
             array = uav.array or self.array
-            if array.num_tx != self.num_tx:
+            if array.num_tx != self.num_tx and uav.radio is None:
                 said = (
                     f"{array.num_tx} transmit elements, and array has {self.num_tx}: all terminals "
                     "share the order in which these take turns; state as many"
@@ -512,7 +590,7 @@ class Scenario(Node):
         for name, uav in self.swarm.items():
             key = common if uav.front_end is None else ("swarm", name, "front_end")
             at: Key = ("array",) if uav.array is None else ("swarm", name, "array")
-            if uav.role != "target":
+            if uav.role != "target" and uav.radio is None:
                 stated.append((key, self.front_end_of(name), at, uav.array or self.array))
         for key, one, at, array in stated:
             yield from self._element_problems((*key, "transmit"), one.transmit, at, self.num_tx)
@@ -545,7 +623,9 @@ class Scenario(Node):
 
     def first_blocks(self) -> dict[str, int]:
         """First resource block of every UAV that is active at the start; a successor takes over its
-        predecessor's."""
+        predecessor's. Radars of different chirps share no blocks."""
+        if self.by_chirp()[0] is not self:
+            return {n: b for one in self.by_chirp() for n, b in one.first_blocks().items()}
         active = {name: uav for name, uav in self.swarm.items() if uav.role == "active"}
         out = {
             name: uav.resource_block
@@ -610,9 +690,12 @@ class Scenario(Node):
                 yield Problem((key, ("city",)), said)
 
     def _sensor_problems(self) -> Iterator[Problem]:
-        if self.sensor is not None and self.sensor not in SENSORS:
-            said = "is read by isac_rt.load, which was not used; state radio and array"
-            yield Problem((("sensor",),), said)
+        stated: dict[Key, str | None] = {("sensor",): self.sensor}
+        stated |= {("swarm", name, "sensor"): uav.sensor for name, uav in self.swarm.items()}
+        for key, sensor in stated.items():
+            if sensor is not None and sensor not in SENSORS:
+                said = "is read by isac_rt.load, which was not used; state radio and array"
+                yield Problem((key,), said)
 
     def _set_problems(self) -> Iterator[Problem]:
         for name, one in self.compare.items():
@@ -663,14 +746,17 @@ def _with_presets(data: Any) -> Any:
 
 
 def _with_own_hardware(uav: Any, data: dict[str, Any]) -> Any:
-    """Complete the array and the noise that a terminal states by those of all."""
-    if not isinstance(uav, dict):
+    """Complete the radio, the array and the noise that a terminal states by those of its sensor or
+    of all."""
+    if not isinstance(uav, dict) or uav.get("role") == "target":
         return uav
-    out = dict(uav)
-    for key in ("array", "noise"):
+    out = with_sensor(uav)
+    for key in ("noise",) if out.get("sensor") else ("radio", "array", "noise"):
         own, common = _plain(out.get(key)), _plain(data.get(key))
         if isinstance(own, dict) and isinstance(common, dict):
             out[key] = {**common, **own}
+            if "bandwidth_hz" not in own and out[key].get("chirp") is not None:
+                out[key].pop("bandwidth_hz", None)  # follows from the chirp
     return out
 
 

@@ -40,11 +40,9 @@ from isac_rt.signal.methods import Auto, Direct, Method
 from isac_rt.simulation.plan import (
     COUNTS_DB,
     MATTERS_DB,
-    decisions,
     extent,
     flight_of_light,
     frame_reach,
-    mechanisms,
     next_slot_delay,
 )
 from isac_rt.simulation.setup import Frame, Setup
@@ -111,8 +109,25 @@ def _spread(values: Sequence[int], count: int) -> list[int]:
 def make_plan(setup: Setup) -> dict[str, Any]:
     """Return the plan of a run: its decisions, and one `Item` per effect with the estimated error.
     Traces a few frames."""
-    plan = setup.plan
-    frames = _spread(range(plan.timetable.frames), PILOT_FRAMES)
+    frames = _spread(range(setup.timetable.frames), PILOT_FRAMES)
+    items = []
+    for one in setup.each:
+        names = ", ".join(one.plan.timetable.blocks) if setup.by_chirp else "all"
+        found = _items(one, frames)
+        items += [replace(i, link=names) if i.link == "all" else i for i in found]
+    if setup.by_chirp:
+        said = "interference, where their bands overlap"
+        items.append(Item("chirps of other radars", "those of the same chirp", said))
+    return {
+        **setup.fidelity(),
+        "coverage": asdict(setup.coverage),
+        "pilot_frames": frames,
+        "items": [asdict(item) for item in items],
+    }
+
+
+def _items(setup: Setup, frames: Sequence[int]) -> list[Item]:
+    """Return the items of the terminals of one chirp, from the paths of some frames."""
     uses: dict[Link, list[Use]] = {}
     light, late, short_lived = 0.0, 0.0, 0
     for frame in frames:
@@ -131,15 +146,7 @@ def make_plan(setup: Setup) -> dict[str, Any]:
         items += _link_items(setup, link, of_link)
     items += _unmodelled_items(setup, light, late, short_lived / len(frames))
     items += [] if setup.has_ideal_hardware else _hardware_items(last)
-    items += _self_calibration_items(setup, last)
-    return {
-        **mechanisms(setup.scenario.propagation, setup.scenario.clutter),
-        **decisions(plan),
-        **extent(setup.city, setup.propagation.census(), setup.scenario.clutter),
-        "coverage": asdict(setup.coverage),
-        "pilot_frames": frames,
-        "items": [asdict(item) for item in items],
-    }
+    return items + _self_calibration_items(setup, last)
 
 
 def _next_slot(setup: Setup) -> float:
@@ -327,9 +334,14 @@ def check(setup: Setup, frames: int = 4) -> dict[str, Any]:
     bound of these frames."""
     rng, count = generator(setup.scenario.seed, "budget check"), setup.timetable.frames
     chosen = sorted(rng.choice(count, min(frames, count), replace=False).tolist())
-    tracer = tracer_of(setup)
-    out: dict[str, dict[str, float]] = {}
-    for number in chosen:
+    links = {name: row for one in setup.each for name, row in _measured(one, chosen).items()}
+    return {"frames": chosen, "links": {name: _in_decibels(row) for name, row in links.items()}}
+
+
+def _measured(setup: Setup, frames: Sequence[int]) -> dict[str, dict[str, float]]:
+    """Return the largest errors and bounds of the links of one chirp in some frames."""
+    tracer, out = tracer_of(setup), dict[str, dict[str, float]]()
+    for number in frames:
         poses, found = setup.find(number)
         frame, truth = setup.frame_of(number, poses, found), found
         if tracer is not None:
@@ -339,7 +351,7 @@ def check(setup: Setup, frames: int = 4) -> dict[str, Any]:
             into = out.setdefault(str(link), {})
             for key, value in _errors(setup, frame, link, found[link], truth[link]).items():
                 into[key] = max(into.get(key, 0.0), value)
-    return {"frames": chosen, "links": {name: _in_decibels(row) for name, row in out.items()}}
+    return out
 
 
 def _in_decibels(row: dict[str, float]) -> dict[str, float | None]:

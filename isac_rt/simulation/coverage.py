@@ -35,6 +35,7 @@ class LinkCoverage:
     Attributes
     ----------
     link : "TX->RX"
+    slot_s, frame_s : what a chirp of each group lasts, and a frame
     max_range_m : of an echo, one way, at an active terminal; of a path's whole length at a passive
         one: what every chirp carries and the maps hold, with data and without
     filtered_range_m : beyond it the IF filter stops the path in every chirp
@@ -50,6 +51,8 @@ class LinkCoverage:
     """
 
     link: str
+    slot_s: float
+    frame_s: float
     max_range_m: float
     filtered_range_m: float
     min_range_m: float
@@ -95,8 +98,6 @@ class Outside:
 class Coverage:
     """All that `coverage` finds; `outside` has a row only for what is outside in some frame."""
 
-    slot_s: float
-    frame_s: float
     frame_interval_s: float
     links: tuple[LinkCoverage, ...]
     outside: tuple[Outside, ...]
@@ -117,7 +118,6 @@ def coverage(
     receivers : for `min_range_m` and `velocity_method`
     schedule : ``array.schedule``
     """
-    w = timetable.waveform
     step = max(1, -(-timetable.frames // MOST_FRAMES))
     frames = range(0, timetable.frames, step)
     flights = _flights(swarm, [timetable.epoch(f) for f in frames])
@@ -131,8 +131,6 @@ def coverage(
         rows = (_outside(link, name, own, arrays, seen) for name in own if name != link.rx)
         outside += [row for row in rows if row.unseen or row.too_fast]
     return Coverage(
-        slot_s=w.slot_duration,
-        frame_s=w.frame_duration,
         frame_interval_s=timetable.interval,
         links=tuple(links),
         outside=tuple(outside),
@@ -163,6 +161,8 @@ def _link_coverage(
     unambiguous_span = antennas.cosine_period(SPEED_OF_LIGHT / float(w.carrier()), passes)[0]
     return LinkCoverage(
         link=str(link),
+        slot_s=w.slot_duration,
+        frame_s=w.frame_duration,
         max_range_m=w.num_range_cells * cell,
         filtered_range_m=w.num_samples * cell,
         min_range_m=first_row(receivers, cell) * cell,

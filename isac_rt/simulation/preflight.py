@@ -305,6 +305,25 @@ def warn_of_interference(
     )
 
 
+def warn_of_other_chirps(waveforms: Mapping[str, Waveform]) -> None:
+    """Warn of plain radars whose different chirps, by name, sweep over the same frequencies: a run
+    leaves out their interference."""
+    bands = {
+        name: (w.carrier_frequency, w.carrier_frequency + w.slope * w.chirp_duration)
+        for name, w in waveforms.items()
+    }
+    pairs = [
+        f"{a} and {b}"
+        for (a, first), (b, second) in itertools.combinations(bands.items(), 2)
+        if max(first[0], second[0]) < min(first[1], second[1])
+    ]
+    if pairs:
+        _warn(
+            f"{', '.join(pairs)} sweep over the same frequencies with different chirps; the run "
+            "leaves out that they interfere; choose other carriers, or turn them away"
+        )
+
+
 def _direct_gain(
     sender: tuple[Pose, Antennas], receiver: tuple[Pose, Antennas], waveform: Waveform
 ) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
@@ -41,7 +41,7 @@ from isac_rt.signal.if_signal import noisy_if_signal
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.simulation.connections import Connections
 from isac_rt.simulation.coverage import Coverage, coverage
-from isac_rt.simulation.plan import Plan
+from isac_rt.simulation.plan import Plan, decisions, extent, mechanisms
 from isac_rt.simulation.preflight import (
     check_flights,
     check_memory,
@@ -50,6 +50,7 @@ from isac_rt.simulation.preflight import (
     check_reference,
     warn_of_aliases,
     warn_of_interference,
+    warn_of_other_chirps,
     warn_of_unseen,
 )
 from isac_rt.simulation.stopwatch import NONE, Seconds
@@ -101,6 +102,8 @@ class Frame:
     uses: Mapping[Link, Use]
     dropped: int
     _setup: Setup = field(repr=False)
+    _by_chirp: Mapping[str, Frame] = field(default_factory=dict, repr=False)
+    """The frame as the radars of each chirp have it, by transmitter; empty where all share one."""
 
     def sent_by(self, schedules: Mapping[str, Schedule]) -> Frame:
         """Return the frame with other antenna schedules of some active terminals."""
@@ -114,22 +117,29 @@ class Frame:
 
     def noise_power(self, link: tuple[str, str]) -> float:
         """E|n|^2 of a sample at a link's receiver [W], Gaussian clutter included."""
-        return self._setup.noise_power(self.poses, Link(*link))
+        frame, link = self._at(link)
+        return frame._setup.noise_power(frame.poses, link)
+
+    def _at(self, link: tuple[str, str]) -> tuple[Frame, Link]:
+        """Return the frame as the radars of a link's chirp have it, and the link."""
+        return self._by_chirp.get(link[0], self), Link(*link)
 
     def ends(self, link: tuple[str, str]) -> Any:
         """Return the hardware that affects the samples of a link's receiver
         (`isac_rt.extensions.hardware.front_end.Ends`)."""
-        link, all_of = Link(*link), self._setup.front_ends
-        senders = dict.fromkeys([link.tx, *self.sent])
-        each = [all_of[name] for name in senders for _ in self.sent[name].streams()]
+        frame, link = self._at(link)
+        all_of, sent = frame._setup.front_ends, frame.sent
+        senders = dict.fromkeys([link.tx, *sent])
+        each = [all_of[name] for name in senders for _ in sent[name].streams()]
         return extension("front_ends")(all_of[link.rx], tuple(each))
 
     def oscillator_noise_left_out(self, link: tuple[str, str]) -> float:
         """Return the oscillator noise within a chirp that `samples` omit, over the thermal
         noise."""
-        link, power, waveform = Link(*link), self.noise_power(link), self._setup.waveform
+        frame, link = self._at(link)
+        power, waveform = frame.noise_power(link), frame._setup.waveform
         left_out = extension("hardware_noise_left_out")
-        return float(left_out(waveform, self._arriving(link), self.ends(link), power))
+        return float(left_out(waveform, frame._arriving(link), frame.ends(link), power))
 
     def samples(self, link: tuple[str, str], ends: Any = None) -> IFCube:
         """Synthesise the IF samples of a link's receiver with noise, dechirped in the resource
@@ -137,8 +147,10 @@ class Frame:
 
         They include the chirps of other active terminals in these blocks, and depend on frame and
         link alone."""
-        link, s = Link(*link), self._setup
-        arriving, noise = self._arriving(link), self._noise(link)
+        frame, link = self._at(link)
+        if frame is not self:
+            return frame.samples(link, ends)
+        s, arriving, noise = self._setup, self._arriving(link), self._noise(link)
         method = s.plan.synthesis(sum(len(p) for _, p in arriving), noise.power)
         received = self._listening(link)
         if ends is None and not s.has_ideal_hardware:
@@ -151,7 +163,8 @@ class Frame:
 
     def received(self, link: tuple[str, str]) -> IFCube:
         """Return the samples of a link's receiver with the board's calibration applied."""
-        return self._setup.calibrated(self.samples(link))
+        frame, link = self._at(link)
+        return frame._setup.calibrated(frame.samples(link))
 
     def _arriving(self, link: Link) -> list[tuple[Transmission, PathSet]]:
         """Return the signals at a link's receiver, those of its transmitter first; antennas that
@@ -211,6 +224,18 @@ class Setup:
     detector needs none."""
     seconds: Seconds = NONE
     """What `prepare` took."""
+    by_chirp: tuple[Setup, ...] = ()
+    """The set-ups of the radars of each chirp, where not all share one; what is said above of the
+    chirp, the paths and the plan is then that of the first."""
+
+    @property
+    def each(self) -> tuple[Setup, ...]:
+        """The set-ups of all chirps; this one where all terminals share one."""
+        return self.by_chirp or (self,)
+
+    def of(self, name: str) -> Setup:
+        """Return the set-up of a terminal's chirp."""
+        return next((one for one in self.by_chirp if name in one.plan.timetable.blocks), self)
 
     def with_antennas(self, antennas: Antennas) -> Setup:
         """Return the set-up with other antennas at every terminal and newly traced paths.
@@ -219,6 +244,8 @@ class Setup:
         ------
         ValueError  If they are not of the waveform's transmit antennas.
         """
+        if self.by_chirp:
+            raise ValueError("terminals have chirps of their own; state swarm.NAME.array")
         if antennas.num_tx != self.waveform.num_tx:
             raise ValueError(
                 f"the waveform is of {self.waveform.num_tx} transmit antennas, the array has "
@@ -307,10 +334,31 @@ class Setup:
             rotation=Rotation.from_rotvec(rotation_vector).as_matrix() @ pose.rotation,
         )
 
+    def fidelity(self) -> dict[str, Any]:
+        """Return what is modelled, as in `isac-rt plan` and summary.json: of the first chirp, and
+        under `by_chirp` what differs for the radars of others."""
+        s = self.scenario
+        out = {
+            **mechanisms(s.propagation, s.clutter),
+            **decisions(self.plan),
+            **extent(self.city, self.propagation.census(), s.clutter),
+        }
+        others = {", ".join(one.plan.timetable.blocks): one for one in self.by_chirp[1:]}
+        differs = {
+            names: {key: value for key, value in one.fidelity().items() if value != out[key]}
+            for names, one in others.items()
+        }
+        return out | {"by_chirp": differs} if differs else out
+
     @cached_property
     def coverage(self) -> Coverage:
         """Coverage of the links, and the UAVs outside it."""
         s = self.scenario
+        if self.by_chirp:
+            each = [one.coverage for one in self.by_chirp]
+            links = tuple(link for one in each for link in one.links)
+            outside = tuple(row for one in each for row in one.outside)
+            return replace(each[0], links=links, outside=outside)
         return coverage(self.swarm, self.timetable, self.arrays, s.receivers, s.schedule)
 
     def noise_power(self, poses: dict[str, Pose], link: Link) -> float:
@@ -319,6 +367,8 @@ class Setup:
 
     def frame(self, number: int) -> Frame:
         """Trace a frame, with the schedule of the scenario."""
+        if self.by_chirp:
+            return self._joint_frame(number)
         poses, traced = self._traced(number)
         return self.frame_of(number, poses, *traced)
 
@@ -344,8 +394,26 @@ class Setup:
 
     def find(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
         """Return the poses and all paths of a frame, weak ones included."""
+        if self.by_chirp:
+            found = [one.find(frame)[1] for one in self.by_chirp]
+            return self.swarm.poses(self.timetable.epoch(frame)), _union(found)
         poses, traced = self._traced(frame)
         return poses, traced.paths
+
+    def _joint_frame(self, number: int) -> Frame:
+        """Return the frames of the radars of each chirp as one."""
+        frames = [one.frame(number) for one in self.by_chirp]
+        return Frame(
+            number,
+            self.swarm.poses(self.timetable.epoch(number)),
+            _union([one.paths for one in frames]),
+            _union([one.sent for one in frames]),
+            _union([one.expected for one in frames]),
+            _union([one.uses for one in frames]),
+            sum(one.dropped for one in frames),
+            self,
+            {name: one for one in frames for name in one.sent},
+        )
 
     def _traced(self, frame: int) -> tuple[dict[str, Pose], Traced]:
         epoch = self.timetable.epoch(frame)
@@ -383,8 +451,15 @@ class Setup:
         return out
 
 
+def _union(parts: Iterable[Mapping[Any, Any]]) -> dict[Any, Any]:
+    """Return the entries of all mappings as one."""
+    return {key: value for part in parts for key, value in part.items()}
+
+
 def link_budgets(setup: Setup) -> list[LinkBudget]:
     """Return the link budget of each link at the first frame."""
+    if setup.by_chirp:
+        return [row for one in setup.by_chirp for row in link_budgets(one)]
     poses = setup.swarm.poses(setup.timetable.epoch(0))
     rows = []
     for link in setup.timetable.links(0):
@@ -424,20 +499,66 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
     dtype('complex64')
     """
     begin = Seconds.of_process()
+    digest = city_digest(scenario.city, scenario.folder) if digest is None else digest
+    alone = [(one, planned(one)) for one in scenario.by_chirp()]
+    # the blocks, and with them the reach, are found out in the run where links are established
+    reach = max(plan.mesh_radius(plan.swarm.middle) for _, plan in alone)
+    parts = [_prepared(one, plan, reach, store, digest) for one, plan in alone]
+    setup = parts[0] if parts[0].scenario is scenario else _joint(scenario, parts)
+    setup = replace(setup, seconds=Seconds.of_process() - begin)
+    warn_of_unseen(setup.coverage)
+    return setup
+
+
+def planned(scenario: Scenario) -> Plan:
+    """Return the plan of a scenario whose terminals share the chirp, after checks of its size and
+    flights."""
     waveform = waveform_of(scenario.radio, scenario.array, scenario.modulation)
-    arrays = arrays_of(scenario, waveform)
-    swarm = swarm_of(scenario)
+    arrays, swarm = arrays_of(scenario, waveform), swarm_of(scenario)
     schedule = schedule_of(scenario.schedule, waveform, generator(scenario.seed, "schedule"))
     timetable = timetable_of(scenario, waveform, schedule)
     check_memory(arrays, timetable)
     check_flights(swarm, timetable)
     check_reference(scenario.noise, scenario.clutter, swarm, timetable)
-    plan = plan_of(scenario, arrays, timetable, swarm)
-    # the blocks, and with them the reach, are found out in the run where links are established
-    reach = plan.mesh_radius(swarm.middle)
+    return plan_of(scenario, arrays, timetable, swarm)
+
+
+def _joint(scenario: Scenario, parts: Sequence[Setup]) -> Setup:
+    """Return the set-ups of the radars of each chirp as one."""
+    warn_of_other_chirps({", ".join(one.plan.timetable.blocks): one.waveform for one in parts})
+    roles = {name: uav.role for name, uav in scenario.swarm.items()}
+    silent: dict[str, int | None] = dict.fromkeys(scenario.first_blocks())
+    each = []
+    for part in parts:
+        blocks = silent | dict(part.timetable.blocks)
+        each.append(
+            replace(part, timetable=replace(part.timetable, first_roles=roles, blocks=blocks))
+        )
+    of = {name: one for one in each for name in one.plan.timetable.blocks}
+    timetable = replace(
+        each[0].timetable,
+        blocks=scenario.first_blocks(),
+        own={name: one.timetable for name, one in of.items() if one is not each[0]},
+    )
+    arrays = Arrays(each[0].arrays.common, {name: one.arrays.of(name) for name, one in of.items()})
+    return replace(
+        each[0],
+        scenario=scenario,
+        arrays=arrays,
+        swarm=swarm_of(scenario),
+        timetable=timetable,
+        by_chirp=tuple(each),
+    )
+
+
+def _prepared(
+    scenario: Scenario, plan: Plan, reach: float, store: PathStore | None, digest: str
+) -> Setup:
+    """Return the set-up of a scenario whose terminals share the chirp; the city as far as
+    `reach` [m]."""
+    waveform, arrays, swarm, timetable = plan.waveform, plan.arrays, plan.swarm, plan.timetable
     radius = np.inf if scenario.access.establish or plan.whole_mesh else reach
     carrier = waveform.carrier_frequency
-    digest = city_digest(scenario.city, scenario.folder) if digest is None else digest
     about = swarm.middle, scenario.city, scenario.folder, carrier
     city = city_about(*about, radius, digest)
     whole = city_about(*about, digest=digest)
@@ -472,10 +593,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
         _expectation_of(scenario, plan, free, believed),
     )
     _ = setup.calibration  # a file that is none is refused here
-    setup = _connected(setup)
-    setup = replace(setup, seconds=Seconds.of_process() - begin)
-    warn_of_unseen(setup.coverage)
-    return setup
+    return _connected(setup)
 
 
 def _maker(
@@ -567,7 +685,7 @@ def timetable_of(scenario: Scenario, waveform: Waveform, schedule: Schedule) -> 
         first_roles={name: uav.role for name, uav in scenario.swarm.items()},
         blocks=scenario.first_blocks(),
         frames=scenario.frames,
-        interval=scenario.frame_interval_s or waveform.frame_duration,
+        interval=scenario.frame_interval_s or scenario.frame_duration_s,
         active_every=scenario.receivers.active_every_frames,
         seed=scenario.seed,
         role_changes=scenario.role_changes,

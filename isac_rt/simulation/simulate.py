@@ -23,7 +23,6 @@ from isac_rt.results.scoring import LinkResult
 from isac_rt.runtime import tracing_in_one_thread
 from isac_rt.scenario.tree import OWN, Scenario
 from isac_rt.simulation.fall_back import Schedules
-from isac_rt.simulation.plan import decisions, extent, mechanisms
 from isac_rt.simulation.preflight import receivers_at_work
 from isac_rt.simulation.progress import Progress, followed
 from isac_rt.simulation.resume import Resume
@@ -172,7 +171,7 @@ class _Run:
         stopwatch.set_up(s.seconds)
 
         def own(link: Link) -> Terminal:
-            return terminal_with(s, link, terminal(s, link))
+            return terminal_with(s.of(link.tx), link, terminal(s.of(link.tx), link))
 
         sets = {OWN: StationSet.of(s, own, scenario.receivers)}
         for name, one in scenario.compare.items():
@@ -222,7 +221,8 @@ class _Run:
                 frame = setup.frame(number)
             while len(at_work) >= at_once:
                 yield at_work.popleft()
-            frame = frame.sent_by({name: self.schedules.of(name) for name in frame.sent})
+            if setup.scenario.array.fall_back:
+                frame = frame.sent_by({name: self.schedules.of(name) for name in frame.sent})
             jobs = {}
             for link in setup.timetable.links(number):
                 reports = [one.reports(link, number) for one in self.sets.values()]
@@ -339,11 +339,7 @@ class _Run:
         compared = {name: one for name, one in self.sets.items() if name != OWN}
         figures = Figures(
             timing=self.stopwatch.so_far(),
-            plan={
-                **mechanisms(s.scenario.propagation, s.scenario.clutter),
-                **decisions(s.plan),
-                **extent(s.city, s.propagation.census(), s.scenario.clutter),
-            },
+            plan=s.fidelity(),
             access=self._access(),
             compared={name: one.blocks() for name, one in compared.items()},
             costs={name: one.costs() for name, one in self.sets.items()} if compared else {},

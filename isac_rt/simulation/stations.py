@@ -39,6 +39,7 @@ def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = N
     >>> [type(standard_terminal(setup, link)).__name__ for link in setup.timetable.links(0)]
     ['ActiveTerminal', 'PassiveTerminal', 'PassiveTerminal']
     """
+    setup = setup.of(link.tx)
     s = settings or setup.scenario
     equipment = extension("equipment")(setup, link, s)
     known = setup.waveform, setup.arrays.at(link), s.receivers, s.tracking
@@ -224,7 +225,10 @@ class StationSet:
         """Build the set before the first frame; `receivers` are the settings of the terminals."""
         timetable, cooperation = setup.timetable, setup.scenario.cooperation
         return cls(
-            {link: Station(setup, link, terminal(link), receivers) for link in timetable.all_links},
+            {
+                link: Station(setup.of(link.tx), link, terminal(link), receivers)
+                for link in timetable.all_links
+            },
             Recorder(timetable, [state.name.lower() for state in TerminalState]),
             setup.swarm,
             None if cooperation == "none" else extension("cooperation")(setup),

@@ -73,7 +73,7 @@ class FrameParts:
         yield "map_range", np.arange(w.num_range_cells) * w.range_cell(link.passes)
         yield "map_velocity", doppler_bins(w) * w.velocity_cell(link.passes)
         if keep & {"boxes", "mask"}:
-            boxes, mask = labels(self._setup, frame, link)
+            boxes, mask = labels(self._setup.of(link.tx), frame, link)
             yield from ((n, v) for n, v in (("boxes", boxes), ("mask", mask)) if n in keep)
 
 

@@ -220,6 +220,12 @@ def error_cdf(ax: Axes, dataset: xr.Dataset, name: str, terminals: bool = False)
     return labelled(ax, f"|{name} error| [{unit}]", "share of errors below")
 
 
+def carrier_of(dataset: xr.Dataset, observer: int) -> float:
+    """Return the carrier of an observer's chirp [Hz]."""
+    own = dataset.get("carrier_hz")
+    return float(dataset.attrs["carrier_hz"] if own is None else own[observer])
+
+
 def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Axes:
     """Power of every path in the ledger of the snapshot frames against its path length ("delay") or
     rate ("doppler")."""
@@ -227,7 +233,7 @@ def path_power(ax: Axes, dataset: xr.Dataset, observer: int, against: str) -> Ax
     x = (
         dataset.path_delay.values * SPEED_OF_LIGHT
         if against == "delay"
-        else -dataset.attrs["carrier_hz"] * dataset.path_delay_rate.values / 1e3
+        else -carrier_of(dataset, observer) * dataset.path_delay_rate.values / 1e3
     )
     for k in (4, 3, 2, 5, 1, 0):
         at = mine & (dataset.path_kind.values == k)

@@ -36,7 +36,7 @@ EXTRA = "interchange"
 def write_ledger(
     paths: Mapping[Link, PathSet],
     file: str | Path,
-    carrier_frequency: float,
+    carrier_frequency: Mapping[str, float],
     attributes: Mapping[str, str | int],
 ) -> None:
     """Write the path ledger of one frame, all links, as NetCDF.
@@ -47,7 +47,7 @@ def write_ledger(
 
     Parameters
     ----------
-    carrier_frequency : of the Doppler shifts [Hz]
+    carrier_frequency : of the Doppler shifts, by transmitter [Hz]
     attributes : of the file, such as `isac_rt.results.provenance.provenance` gives
 
     Raises
@@ -63,7 +63,7 @@ def write_ledger(
             float,
             "Hz",
             "Doppler shift at the carrier, positive closing",
-            lambda p: -carrier_frequency * p.delay_rate,
+            lambda p: -carrier_frequency[p.tx] * p.delay_rate,
         ),
         "tx_radius": Column(float, "m", f"{curvature} transmitter", "tx_radius"),
         "rx_radius": Column(float, "m", f"{curvature} receiver", "rx_radius"),

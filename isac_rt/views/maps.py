@@ -152,7 +152,8 @@ def equivalent_range(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int
     """Range cell over chirp of the first group before the data are removed: what the delay symbols
     do to every echo."""
     magnitude = dataset.map_equivalent_range.values[snapshot, observer]
-    magnitude = magnitude[np.isfinite(magnitude).all(axis=1)]
+    inside = np.isfinite(magnitude)
+    magnitude = magnitude[np.ix_(inside.any(axis=1), inside.any(axis=0))]
     level = 20 * np.log10(np.maximum(magnitude, _TINY))
     level = level - level.max()
     draw_map(

@@ -142,7 +142,8 @@ def write_report(
     ------
     isac_rt.storage.StorageError  If the folder cannot be written.
     """
-    s, d, radio = results.summary, results.dataset, results.scenario.radio
+    s, d = results.summary, results.dataset
+    radios = [one.radio for one in results.scenario.by_chirp()]
     scene, no_scene = _scene(d, city)
     materials = json.loads(d.attrs["materials"])
     environment = jinja2.Environment(
@@ -157,8 +158,8 @@ def write_report(
         summary=s,
         span=f"{span:.2f} s",
         roles=", ".join(_count(roles.count(r), _ROLES.get(r, r)) for r in dict.fromkeys(roles)),
-        carrier=f"{radio.carrier_hz / 1e9:g} GHz",
-        bandwidth=f"{radio.bandwidth_hz / 1e6:g} MHz",
+        carrier=" and ".join(f"{radio.carrier_hz / 1e9:g} GHz" for radio in radios),
+        bandwidth=" and ".join(f"{radio.bandwidth_hz / 1e6:g} MHz" for radio in radios),
         tables=tables,
         coverage=json.loads(d.attrs.get("coverage", "null")),
         walls=wall_table(d, city) if city is not None and "det_face" in d else Table((), ()),

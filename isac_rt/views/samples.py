@@ -91,9 +91,10 @@ def write_samples(
     """
     writers: dict[Link, Writer] = {}
     received = {f: setup.timetable.links(f) for f in frames}
-    w = setup.waveform
-    rows = sum(setup.arrays.at(one).num_rx for f in frames for one in links if one in received[f])
-    size = rows * w.num_groups * w.num_chirps * w.num_samples
+    size = 0
+    for link in (one for there in received.values() for one in links if one in there):
+        w = setup.of(link.tx).waveform
+        size += setup.arrays.at(link).num_rx * w.num_groups * w.num_chirps * w.num_samples
     check_folder(folder, size * _WRITERS[form].sample_bytes)
     with _staged(Path(folder)) as staged:
         for done, number in enumerate(frames):

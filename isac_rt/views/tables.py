@@ -283,15 +283,20 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
     rows = [(", ".join(names), *row) for row, names in alike.items()]
     limits = _filled(Table(("Coverage", *_COVERAGE), rows))
     farthest = max(seen["links"], key=lambda of: of["max_range_m"])
-    slot, frame, interval = (
-        number(seen[key] * unit)
-        for key, unit in (("slot_s", 1e6), ("frame_s", 1e3), ("frame_interval_s", 1e3))
+    chirps: dict[str, list[str]] = {}
+    for of in seen["links"]:
+        slot, frame = number(of["slot_s"] * 1e6), number(of["frame_s"] * 1e3)
+        chirps.setdefault(f"{slot} us, a frame {frame} ms", []).append(link_words(of["link"]))
+    durations = " or ".join(
+        f"{lasts} ({', '.join(links)})" if len(chirps) > 1 else lasts
+        for lasts, links in chirps.items()
     )
+    interval = number(seen["frame_interval_s"] * 1e3)
     past = ""
     if farthest["filtered_range_m"] > farthest["max_range_m"]:
         past = "; echoes from up to twice the maximum range disturb some chirps"
     words = (
-        f"A slot (one chirp of each group) lasts {slot} us, a frame {frame} ms, and one starts "
+        f"A slot (one chirp of each group) lasts {durations}, and one starts "
         f"every {interval} ms. Range: one way for echoes, path length between two terminals{past}. "
         "Faster UAVs alias in velocity. Beam: width of the array's main lobe at boresight. Field "
         "of view: to each side; directions are unambiguous to "

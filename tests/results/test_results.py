@@ -129,7 +129,7 @@ def test_every_variable_has_units_and_a_meaning(run, tmp_path):
     write_ledger(
         {("AT", "PT1"): fake_records(run.scenario)[0].observers["PT1"].paths},
         tmp_path / "l.nc",
-        77e9,
+        {"AT": 77e9},
         provenance.provenance(run.scenario),
     )
     with xr.open_dataset(tmp_path / "l.nc", engine="h5netcdf") as ledger:
@@ -210,7 +210,8 @@ def test_ledger_holds_every_path_of_every_link(tmp_path, run):
     """Exact; Doppler from the closed form. Seen to fail with the opposite sign of doppler."""
     records = fake_records(fake_scenario())[0].observers
     links = {("AT", name): o.paths for name, o in records.items()}
-    write_ledger(links, tmp_path / "ledger.nc", 77e9, provenance.provenance(run.scenario))
+    about = provenance.provenance(run.scenario)
+    write_ledger(links, tmp_path / "ledger.nc", {"AT": 77e9}, about)
     with xr.open_dataset(tmp_path / "ledger.nc", engine="h5netcdf") as opened:
         d = opened.load()
     p = records["PT1"].paths
@@ -221,7 +222,7 @@ def test_ledger_holds_every_path_of_every_link(tmp_path, run):
     assert np.array_equal(
         mine.target_name.values[mine.target.values[mine.target.values >= 0]], ["U1"]
     )
-    write_ledger({}, tmp_path / "empty.nc", 77e9, {})
+    write_ledger({}, tmp_path / "empty.nc", {}, {})
 
 
 @pytest.mark.sionna

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from talking import small
 from test_fall_back import scenario as dense_scenario
+from test_own_chirps import TREE as TWO_BOARDS
 
 from isac_rt.cli.cli import main
 from isac_rt.cli.interruption import Terminated
@@ -37,6 +38,7 @@ from isac_rt.track.settings import Tracking
 
 ROOT = Path(__file__).parents[2]
 SCENES = ROOT / "scenes"
+UNSEEN = pytest.mark.filterwarnings("ignore::isac_rt.scenario.file.ScenarioWarning")
 SMALL = ["radio.samples_per_chirp=256", "radio.chirps_per_frame=36"]
 
 
@@ -65,10 +67,11 @@ def assert_equal_results(found, expected):
 
 def scenarios():
     """Tracks, acquisition, data and fall-back; feedback, clocks, slips and self-calibration; ray
-    tracing, shadows and clutter in a city."""
+    tracing, shadows and clutter in a city; radars of two chirps."""
     access = ["frames=9", "access.feedback=true", "receivers.self_calibration=positions"]
     return {
         "dense": lambda: dense_scenario(frames=7),
+        "two boards": lambda: load(TWO_BOARDS),
         "access": lambda: load(SCENES / "access_swarm.yaml", access),
         "canyon": lambda: load(
             SCENES / "street_canyon.yaml",
@@ -82,6 +85,7 @@ def scenarios():
     "name",
     [
         "dense",
+        pytest.param("two boards", marks=UNSEEN),
         pytest.param("access", marks=pytest.mark.slow),
         pytest.param("canyon", marks=pytest.mark.sionna),
     ],

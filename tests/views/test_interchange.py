@@ -107,7 +107,7 @@ def test_the_ledger_has_positive_doppler_of_what_comes_nearer(tmp_path):
         epoch=0.1,
         target_names=("A", "P"),
     )
-    write_ledger({Link("A", "P"): paths}, tmp_path / "p.nc", 77e9, {})
+    write_ledger({Link("A", "P"): paths}, tmp_path / "p.nc", {"A": 77e9}, {})
     with xr.open_dataset(tmp_path / "p.nc") as found:
         assert found.doppler.values == pytest.approx([12 / c * 77e9, -7.5 / c * 77e9])
 

@@ -159,7 +159,7 @@ class Cooperation(Stateful):
     ) -> bool:
         """Return whether an active terminal surely detects a small UAV at a place: in its field of
         view and range, not occluded, by the radar equation in noise."""
-        s, pose = self._setup, poses[link.rx]
+        s, pose = self._setup.of(link.tx), poses[link.rx]
         w, antennas = s.waveform, s.arrays.of(link.rx)
         distance = float(np.linalg.norm(place - pose.position))
         towards = pose.to_body((place - pose.position) / distance)
@@ -178,7 +178,7 @@ class Cooperation(Stateful):
 
     def _observe(self, frame: int, link: Link, received: LinkResult) -> None:
         """A terminal takes down the confirmed tracks of one of its links."""
-        setup, tracks = self._setup, received.tracks
+        setup, tracks = self._setup.of(link.tx), received.tracks
         time = setup.timetable.epoch(frame, link.tx)
         own = setup.believed(link.rx, setup.swarm.trajectories[link.rx].pose(time))
         clock = 0.0
