@@ -244,7 +244,7 @@ MAX_LINES = {
     "receive": 6045,
     "track": 1926,
     "scenario": 1946,
-    "results": 3699,
+    "results": 3700,
     "simulation": 3578,
     "sweep": 2785,
     "views": 3513,
