@@ -151,6 +151,7 @@ EXTENSIONS = {
     "map_buildings": "isac_rt.extensions.city_files.footprints:footprints",
     "flight_log": "isac_rt.extensions.flights.logs:flight_log",
     "antenna_pattern": "isac_rt.extensions.antenna_files.patterns:antenna_pattern",
+    "moving_centres": "isac_rt.extensions.street.centres:moving_centres",
     "map_georeference": "isac_rt.extensions.city_files.footprints:located",
 }
 """Parts that the core takes from its extensions: "module:object" by what it is there."""

@@ -20,6 +20,9 @@ from isac_rt.kernels.vector import (
     zip_low,
 )
 
+BRIEF = 1e-6
+"""Share of a slot by which the life of a path of one slot may be longer."""
+
 
 class Numbers(NamedTuple):
     """The waveform's numbers in compiled code.
@@ -168,10 +171,15 @@ class _Workspace(NamedTuple):
 
 
 class OneByOne(NamedTuple):
-    """Paths and group offsets (K,) of tones, and the memory of their sums."""
+    """Paths and group offsets (K,) of tones, and the memory of their sums.
+
+    The first `slots[0]` may live in every slot; those that may live in slot p follow at `slots[p]`
+    to `slots[p + 1]`.
+    """
 
     path: np.ndarray
     offset: np.ndarray
+    slots: np.ndarray
     tones: Any
     workspace: _Workspace
 
@@ -187,15 +195,43 @@ def one_by_one(waveform: Any, tones: Any) -> OneByOne:
         aligned(2 * LANES * blocks), aligned(4 * LANES), aligned(2 * LANES), offsets
     )
     path, offset = tones.sources(waveform)
-    return OneByOne(path, offset, tones, workspace)
+    brief = lives_briefly(waveform, tones)[path]
+    order, slots = _by_slot(waveform, tones.begin[path], tones.end[path], brief)
+    return OneByOne(path[order], offset[order], slots, tones, workspace)
+
+
+def lives_briefly(waveform: Any, tones: Any) -> np.ndarray:
+    """Mark the paths that live for a slot at most (K,)."""
+    return tones.end - tones.begin <= waveform.slot_duration * (1 + BRIEF)
+
+
+def _by_slot(
+    waveform: Any, begin: np.ndarray, end: np.ndarray, is_brief: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of paths that live from `begin` to `end` (K,) in the order of `OneByOne`, a brief one
+    for each slot that it may touch, and where each slot's begin (P + 1,)."""
+    w, brief, whole = waveform, np.flatnonzero(is_brief), np.flatnonzero(~is_brief)
+    middle = w.fast_time[w.num_samples // 2] - w.frame_duration / 2
+    latest = middle + (w.num_groups - 1) * w.group_spacing
+    first = np.ceil((begin[brief] - latest) / w.slot_duration).astype(np.int64)
+    last = np.floor((end[brief] - middle) / w.slot_duration).astype(np.int64)
+    touched = np.maximum(last - first + 1, 0)
+    row = np.repeat(brief, touched)
+    slot = np.repeat(first - np.cumsum(touched) + touched, touched) + np.arange(row.size)
+    row, slot = (a[(slot >= 0) & (slot < w.num_chirps)] for a in (row, slot))
+    order = np.concatenate([whole, row[np.argsort(slot, kind="stable")]])
+    count = np.bincount(slot, minlength=w.num_chirps)
+    return order, np.cumsum([whole.size, *count])
 
 
 @jit(fast=True, borrows=True)
 def sum_paths(alone, w, half, m, r, p):
     """Add the paths to the sums of chirp p of group m at element r; how many it has."""
-    path, offset, t, workspace = alone
+    path, offset, slots, t, workspace = alone
     groups, time, count = t.send.shape[1], w.first + p * w.slot + m * w.spacing, 0
-    for i in range(path.shape[0]):
+    whole, here = slots[0], slots[p]
+    for n in range(whole + slots[p + 1] - here):
+        i = n if n < whole else n - whole + here
         k, source = path[i], m - offset[i]
         if source < 0 or source >= groups or time < t.begin[k] or time >= t.end[k]:
             continue

@@ -143,11 +143,12 @@ class Gridded:
 class Auto:
     """Choose a method for each path: `Direct` for few paths, else `Gridded` for most.
 
-    Of many paths `Direct` makes lines of sight (the grid omits their joint curvature), paths too
-    fast for `GRIDDED_ERROR`, and the `max_direct` strongest of those whose error, integrated
-    coherently over the cube, could exceed the noise of a cell (power error^2 size > noise_power).
-    Below-noise paths take a faster grid with a larger error: integrated likewise and summed over a
-    range-Doppler cell, it stays under `below_noise` times the noise.
+    Paths that live for a slot at most are made directly. Of many others `Direct` makes lines of
+    sight (the grid omits their joint curvature), paths too fast for `GRIDDED_ERROR`, and the
+    `max_direct` strongest of those whose error, integrated coherently over the cube, could exceed
+    the noise of a cell (power error^2 size > noise_power). Below-noise paths take a faster grid
+    with a larger error: integrated likewise and summed over a range-Doppler cell, it stays under
+    `below_noise` times the noise.
 
     Attributes
     ----------
@@ -169,6 +170,11 @@ class Auto:
     def choose(self, waveform: Waveform, tones: Tones) -> tuple[np.ndarray, np.ndarray]:
         """Mark the paths for `Direct`, and those of the others that are below noise: (K,) bool
         each."""
+        brief = signal_direct.lives_briefly(waveform, tones)
+        if brief.any():
+            alone, faint = brief.copy(), np.zeros(tones.size, bool)
+            alone[~brief], faint[~brief] = self.choose(waveform, tones.select(~brief))
+            return alone, faint
         every, elements = np.ones(tones.size, bool), tones.rx_delay.shape[1]
         size = float(np.prod(_shape(waveform, tones)))
         error = ERROR_AT_REST + ERROR_PER_SPEED * tones.speed(waveform.frame_duration)

@@ -151,7 +151,8 @@ class Frame:
         if frame is not self:
             return frame.samples(link, ends)
         s, arriving, noise = self._setup, self._arriving(link), self._noise(link)
-        method = s.plan.synthesis(sum(len(p) for _, p in arriving), noise.power)
+        lasting = sum(len(self.paths[Link(sent.name, link.rx)]) for sent, _ in arriving)
+        method = s.plan.synthesis(lasting, noise.power)
         received = self._listening(link)
         if ends is None and not s.has_ideal_hardware:
             ends = self.ends(link)
@@ -173,11 +174,14 @@ class Frame:
             received = ", ".join(map(str, self.paths))
             raise ValueError(f"{link} is not received in frame {self.number}; there are {received}")
         s, when = self._setup, self._setup.timetable.epoch(self.number, link.tx)
-        out = []
+        out: list[tuple[Transmission, PathSet]] = []
         for name in dict.fromkeys([link.tx, *self.sent]):
             clock = s.connections.clock_difference(name, link, when)
+            paths = self.paths[Link(name, link.rx)]
+            if s.moving_centres is not None:
+                paths = s.moving_centres.with_centres(paths, self.poses, when)
             sent = replace(self.sent[name], clock_offset=clock.offset, clock_drift=clock.drift)
-            out += [(one, self.paths[Link(name, link.rx)]) for one in sent.streams()]
+            out += [(one, paths) for one in sent.streams()]
         return out
 
     def _listening(self, link: Link) -> tuple[ReceiveArray, Reference]:
@@ -289,6 +293,16 @@ class Setup:
             for name, uav in s.swarm.items()
             if uav.role != "target"
         }
+
+    @cached_property
+    def moving_centres(self) -> Any:
+        """Scattering centres of UAVs beside their echoes, which synthesis alone sees
+        (`isac_rt.extensions.street.centres.MovingCentres`); None without."""
+        if not any(uav.rotors for uav in self.swarm.uavs.values()):
+            return None
+        sections = self.reference.sections
+        make = extension("moving_centres")
+        return make(self.swarm, sections, self.waveform, self.scenario.seed)
 
     @cached_property
     def calibration(self) -> Any:

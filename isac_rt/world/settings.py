@@ -26,6 +26,10 @@ MAX_SPEED_MPS = 1e4
 3e-5 here."""
 
 
+SOUND_MPS = 340.0
+"""Speed of sound, below which tips of blades stay."""
+
+
 class MaterialOverride(Node):
     """Properties of one material that replace those of the table; what is left out keeps its table
     value."""
@@ -248,6 +252,41 @@ class Rcs(Node):
             yield Problem((("table",), ("model",)), said)
 
 
+class Rotors(Node):
+    """Rotors of a UAV, whose blades turn in the plane across its body's Z axis."""
+
+    number: Annotated[int, Field(ge=1, le=16)] = 4
+    """Number of rotors, evenly spaced about the body, the first halfway between ahead and right;
+    neighbours turn in opposite directions. By default four, a quadcopter."""
+    arm_m: Annotated[float, Field(ge=0, le=10)] = 0.2
+    """Distance of each rotor's hub from the middle of the body [m]. The default is that of a
+    quadcopter of 1 kg."""
+    blades: Annotated[int, Field(ge=1, le=8)] = 2
+    """Number of blades of each rotor; by default two."""
+    blade_length_m: Annotated[float, Field(gt=0, le=1)] = 0.12
+    """Length of a blade from the hub to its tip [m]. The default is that of a quadcopter of
+    1 kg."""
+    rev_per_min: Annotated[float, Field(ge=0, le=100_000)] = 6000.0
+    """Revolutions per minute. The default is that of a quadcopter of 1 kg that hovers; 0: blades
+    stand still."""
+    blade_dbsm: Decibels | None = None
+    """Cross-section of a blade at its flash, seen across its length [dBsm]. null, the default: that
+    of a plastic edge, blade_length_m^2/pi less 11.4 dB (docs/moving.md)."""
+
+    @property
+    def tip_speed(self) -> float:
+        """Speed of a blade's tip [m/s]."""
+        return 2 * math.pi * self.rev_per_min / 60 * self.blade_length_m
+
+    def problems(self) -> Iterator[Problem]:
+        if self.tip_speed > SOUND_MPS:
+            yield Problem(
+                (("rev_per_min",), ("blade_length_m",)),
+                f"the tips fly at {self.tip_speed:.4g} m/s, faster than sound ({SOUND_MPS:g} m/s); "
+                "lower rev_per_min, or shorten the blades",
+            )
+
+
 class Waypoint(Node):
     """Where a UAV is at one time."""
 
@@ -322,6 +361,8 @@ class Uav(Node):
     the UAV flies to. Targets outside the field of view about it are not seen."""
     rcs: Rcs = Rcs()
     """Radar cross-section of the UAV: how strong its echo is. By default that of a small UAV."""
+    rotors: Rotors | None = None
+    """Rotors whose blades modulate the UAV's echo. null, the default: none."""
     clock_offset_s: Finite = 0.0
     """How late the UAV's clock is at time 0 [s]: what it sends arrives later by this, what it
     receives seems to arrive earlier. By default all clocks agree."""
@@ -373,6 +414,9 @@ class Uav(Node):
         if any(turned) and self.boresight != "velocity":
             said = "the waypoints' attitude_deg says where the UAV looks; leave one of the two out"
             yield Problem((("boresight",), ("waypoints",)), said)
+        if self.rotors is not None and self.rcs.model == "relative":
+            said = "have a cross-section in square metres; give the UAV another rcs.model"
+            yield Problem((("rotors",), ("rcs", "model")), said)
         if (speed := math.hypot(*self.velocity_mps)) > MAX_SPEED_MPS:
             yield Problem((("velocity_mps",),), _too_fast(speed))
         if self.waypoints is None and self.position_m is None:

@@ -91,3 +91,23 @@ def test_noise_is_its_twin():
     first = np.uint64(2**32 - 700)
     # float32 of a logarithm and a sine
     assert_twins_agree("isac_rt.signal.noise.add_stream", out, *numbers, first, rtol=2e-6)
+
+
+@pytest.mark.parametrize("between", [False, True])
+def test_paths_of_a_slot_sound_in_its_chirps_alone(between):
+    """Paths that live for a slot or half a one, also from one group's chirp on, are the twin's, who
+    asks each of them in every chirp. Planted bugs: `latest` without the spacing of the groups;
+    `slots[p]` for `slots[p + 1]`; those that live for a slot left to the grid."""
+    w, t = tones_of(300)
+    rng = np.random.default_rng(8)
+    later = between * (w.fast_time[w.num_samples // 2] + w.group_spacing / 2)
+    begin = rng.integers(-1, 6, 300) * w.slot_duration + later - w.frame_duration / 2
+    begin[:20] = -np.inf
+    life = np.where(np.arange(300) % 3, 1.0, 0.5) * w.slot_duration
+    t = t._replace(begin=begin, end=np.where(np.isinf(begin), np.inf, begin + life))
+    alone, faint = Auto(noise_power=1.0, below_noise=1.0).choose(w, t)
+    assert alone[20:].all() and not faint[20:].any()
+    samples = np.zeros((w.num_groups, 15, 6, w.num_samples), np.complex64)
+    every, noise = np.ones(300, bool), WhiteNoise(0.0, np.array([3, 5], np.uint32))
+    arguments = samples, w, t, noise, every, ~every
+    assert_twins_agree("isac_rt.signal.methods.add_up", *arguments, rtol=3e-6)

@@ -1,0 +1,1 @@
+"""The street lives: rotors and airframes, rain, foreign radars."""

@@ -1,0 +1,321 @@
+"""Rotors: samples against a sum in float64 at every sample, and blades against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import jv
+
+import isac_rt as irt
+from isac_rt.extensions.street.centres import MovingCentres, remainder
+from isac_rt.extensions.street.rotors import Blades, blade_points, blade_section, blades_of
+from isac_rt.frame.link import Link
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.propagation.pathset import PathKind, make_paths
+from isac_rt.scenario.tree import Scenario
+from isac_rt.signal.exact import filter_gain
+from isac_rt.world.settings import Rotors, Uav
+from isac_rt.world.swarm import Pose, Swarm
+
+OWN = Link("radar", "radar")
+
+
+class Isotropic:
+    """Cross-section of one square metre."""
+
+    def square_metres(self, incident, observed):
+        return np.ones(incident.shape[:-1])
+
+
+def scenario(chirps=24, **uav):
+    flight = {"position_m": [1.0, 6.0, 1.5], "velocity_mps": [3.0, -4.0, 1.0]}
+    return Scenario.model_validate(
+        {
+            "frames": 2,
+            "sensor": "awr1843",
+            "radio": {"chirps_per_frame": chirps},
+            "receiver_preset": "plain",
+            "accuracy": {"preset": "everything"},
+            "swarm": {
+                "radar": {"role": "active", "position_m": [0, 0, 1], "boresight": [0, 1, 0.1]},
+                "Q": {
+                    "role": "target",
+                    "rcs": {"model": "constant", "value_dbsm": -10},
+                    **flight,
+                    **uav,
+                },
+            },
+        }
+    )
+
+
+def circling(turning, radius, hub=(0.0, 0.0, 0.0), phase=0.3):
+    """One point of a square metre that circles about a hub."""
+    one = (np.array([v]) for v in (radius, phase, turning, 1.0))
+    return Blades(np.array([hub]), *one)
+
+
+def slow_time(body, distance, w, receiver=None):
+    """Signals of a body's centres `distance` ahead in each slot of a frame about time 0, carrier
+    phase included, without that of the body; also the slots' middles, and the paths."""
+    ends = {"A": Pose.at_rest(), "B": Pose.at_rest(receiver or (0, 0, 0))}
+    place = np.array([0.0, distance, 0.0])
+    swarm = Swarm({"U": Uav(role="target", position_m=tuple(place))})
+    legs = place - np.array([ends["A"].position, ends["B"].position])
+    length = np.linalg.norm(legs, axis=1)
+    echo = make_paths(
+        gain=[1.0],
+        delay=[length.sum() / SPEED_OF_LIGHT],
+        departure=legs[:1] / length[0],
+        arrival=legs[1:] / length[1],
+        kind=PathKind.TARGET,
+        target=0,
+        points=place[None, None],
+        faces=[[-1]],
+        tx="A",
+        rx="A" if receiver is None else "B",
+        epoch=0.0,
+        target_names=("U",),
+    )
+    centres = MovingCentres(swarm, {"U": Isotropic()}, w, {"U": body})
+    poses = ends | swarm.poses(0.0)
+    pieces = centres.with_centres(echo, poses, 0.0)
+    pieces = pieces.select(np.arange(1, len(pieces)))
+    t = np.repeat(centres.slots(0.0)[1], len(body.amplitudes()))
+    delay = pieces.delay + (pieces.delay_rate + pieces.delay_accel * t / 2) * t
+    beyond = (delay - echo.delay) * w.carrier_frequency
+    each = pieces.gain * np.exp(2j * np.pi * beyond)
+    return each.reshape(w.num_chirps, -1).sum(axis=1), centres.slots(0.0)[1], pieces
+
+
+def synthesised(setup, frame, method):
+    """Samples without noise, of the body and with a set-up of rotors of its blades."""
+    links, ears = frame._arriving(OWN), frame._listening(OWN)
+    return irt.if_signal(setup.waveform, links, *ears, method).samples
+
+
+def sum_of_points(setup, frame):
+    """Samples of the circling points alone, from positions of elements and points at every
+    sample."""
+    w, uav = setup.waveform, setup.scenario.swarm["Q"]
+    rotors, antennas = uav.rotors, setup.arrays.of("radar")
+    body = blades_of(rotors, w, setup.scenario.seed, "Q")
+    pose = frame.poses["radar"]
+    tx = pose.position + pose.to_world(antennas.tx_positions)
+    rx = pose.position + pose.to_world(antennas.rx_positions)
+    q = frame.poses["Q"]
+    forward = np.array([q.velocity[0], q.velocity[1], 0.0])
+    forward /= np.linalg.norm(forward)
+    right = np.array([forward[1], -forward[0], 0.0])
+    schedule = frame.sent["radar"].schedule
+    out = np.zeros((1, len(rx), w.num_chirps, w.num_samples), complex)
+    middle = setup.timetable.epoch(frame.number)
+    gain = frame.paths[OWN].gain[0] * np.sqrt(blade_section(rotors) / 0.1)
+    for p in range(w.num_chirps):
+        t = p * w.slot_duration + w.fast_time - w.frame_duration / 2
+        place = q.position + np.outer(t, q.velocity)
+        for k in range(body.radius.size):
+            angle = body.phase[k] + body.turning[k] * (t + middle)
+            arm = np.sin(angle)[:, None] * right + np.cos(angle)[:, None] * forward
+            hub = body.hub[k, 0] * right + body.hub[k, 1] * forward
+            point = place + hub + body.radius[k] * arm
+            there = np.linalg.norm(point - tx[schedule[0, p]], axis=1)
+            near = np.linalg.norm(place - pose.position, axis=1)
+            away = np.linalg.norm(point - pose.position, axis=1)
+            share = body.amplitude[k] / np.sqrt(blade_section(rotors)) * (near / away) ** 2
+            for r, ear in enumerate(rx):
+                tau = (there + np.linalg.norm(point - ear, axis=1)) / SPEED_OF_LIGHT
+                out[0, r, p] += gain.conj() * share * np.exp(2j * np.pi * w.phase(tau, w.fast_time))
+    return out * filter_gain(w, 0.0) * frame.sent["radar"].amplitude
+
+
+@pytest.mark.parametrize("rev_per_min", [6000.0, 0.0])
+def test_samples_are_the_sum_over_points_at_every_sample(rev_per_min):
+    """0.05 % of the sum. Planted bugs: `delay_accel` of centres without that of the return;
+    `delay` without the term in the square of the slot's time; the blade's places at time 0 in
+    every frame; velocity without that of the UAV in `leg`."""
+    rotors = {"number": 2, "blade_length_m": 0.05, "arm_m": 0.3, "rev_per_min": rev_per_min}
+    rotors["blade_dbsm"] = 10.0  # over the rounding of the body's samples
+    setup = irt.prepare(scenario(rotors=rotors))
+    frame = setup.frame(1)
+    body = irt.prepare(scenario())
+    found = synthesised(setup, frame, irt.Direct()) - synthesised(body, body.frame(1), irt.Direct())
+    truth = sum_of_points(setup, frame)
+    assert np.linalg.norm(found - truth) < 5e-4 * np.linalg.norm(truth)
+
+
+def test_bistatic_edge_is_two_v_cos_half_beta_over_lambda():
+    """Planted bug: `back.rate` left out of `rate`."""
+    w = irt.Waveform(num_chirps=300, num_groups=1)
+    turning, radius = 2 * np.pi * 6000 / 60, 0.12
+    receiver, distance = (2e3, 0.0, 0.0), 1e3
+    half = np.arctan2(2e3, 1e3) / 2
+    _, t, pieces = slow_time(circling(turning, radius), distance, w, receiver)
+    doppler = -(pieces.delay_rate + pieces.delay_accel * t) * w.carrier_frequency
+    edge = 2 * turning * radius * np.cos(half) / w.wavelength
+    assert abs(doppler.max() - edge) < 2e-4 * edge
+
+
+@pytest.mark.parametrize("blades", [2, 4])
+def test_blades_flash_every_share_of_a_turn(blades):
+    """A flash every 1/(blades x rev/s). Planted bug: `2 * np.pi` in `blades_of` without 2."""
+    w = irt.Waveform(num_chirps=450, num_groups=1)
+    rotors = Rotors(number=1, arm_m=0.0, blades=blades, rev_per_min=3000)
+    rotors = rotors.model_copy(update={"blade_length_m": 0.03, "blade_dbsm": 0.0})
+    signal, t, _ = slow_time(blades_of(rotors, w, 1, "U"), 1e5, w)
+    level = np.abs(signal)
+    # two blades in line flash at once
+    peaks = np.flatnonzero(
+        (level > 1.6) & (level >= np.roll(level, 1)) & (level > np.roll(level, -1))
+    )
+    period = 1 / (blades * 3000 / 60)
+    assert peaks.size >= 2
+    assert np.abs(np.diff(t[peaks]) - period).max() < 2 * w.slot_duration
+
+
+def test_a_circling_point_has_bessel_lines():
+    """Line n of a point at radius a has the amplitude J_n(4 pi a/lambda), to 1e-6. Planted bugs:
+    sine and cosine exchanged in the velocity alone; `hub` left out of the place."""
+    w = irt.Waveform(num_chirps=255, num_groups=1)
+    radius, per_frame = 0.01, 1
+    turning = 2 * np.pi * per_frame / w.frame_duration
+    signal, _, _ = slow_time(circling(turning, radius), 1e6, w)
+    lines = np.abs(np.fft.fft(signal))[np.arange(-40, 41) * per_frame] / signal.size
+    truth = np.abs(jv(np.arange(-40, 41), 4 * np.pi * radius / w.wavelength))
+    assert np.abs(lines - truth).max() < 1e-6
+
+
+def test_a_blade_of_points_equals_its_integral():
+    """At all aspects to 1e-5 of a flash. Planted bug: half the points in `num_points`."""
+    length, wave_number = 0.12, 2 * np.pi * 78e9 / SPEED_OF_LIGHT
+    place, weight = blade_points(length, wave_number)
+    x = np.linspace(-2, 2, 1001) * wave_number * length / 2
+    found = np.exp(2j * np.outer(x, place / length)) @ weight
+    truth = np.sinc(x / np.pi) * np.exp(1j * x)
+    assert np.abs(found - truth).max() < 1e-5
+    assert place.size < 1.15 * length / (SPEED_OF_LIGHT / 78e9 / 4)
+
+
+def test_energy_of_a_turn_is_that_of_the_integral():
+    """Mean power of a blade over a turn. Planted bug: `np.sqrt(blade_section(r))` without the
+    root."""
+    w = irt.Waveform(num_chirps=4095, num_groups=1)
+    rate = 60 / w.frame_duration
+    rotors = Rotors(number=1, arm_m=0.0, blades=1, blade_length_m=0.03, rev_per_min=rate)
+    signal, _, _ = slow_time(blades_of(rotors, w, 1, "U"), 1e5, w)
+    k = 2 * np.pi / w.wavelength
+
+    def pattern(angle):
+        return np.sinc(k * 0.03 * np.sin(angle) / np.pi) ** 2
+
+    mean = quad(pattern, 0, np.pi / 2, limit=500)[0] / (np.pi / 2)
+    assert np.mean(np.abs(signal) ** 2) == pytest.approx(blade_section(rotors) * mean, rel=1e-3)
+
+
+def test_blades_seen_along_the_axis_only_shift_the_phase_by_spreading():
+    """A rotor whose plane lies across the view modulates nothing. Planted bug: `arm` along the
+    body's Y and Z."""
+    w = irt.Waveform(num_chirps=66, num_groups=1)
+    body = circling(2 * np.pi * 100, 0.12)
+    ends = {"A": Pose.at_rest()}
+    swarm = Swarm({"U": Uav(role="target", position_m=(0, 0, 1e4))})
+    echo = make_paths(
+        gain=[1.0],
+        delay=[2e4 / SPEED_OF_LIGHT],
+        departure=[[0, 0, 1]],
+        arrival=[[0, 0, 1]],
+        kind=PathKind.TARGET,
+        target=0,
+        points=[[[0, 0, 1e4]]],
+        faces=[[-1]],
+        tx="A",
+        rx="A",
+        epoch=0.0,
+        target_names=("U",),
+    )
+    centres = MovingCentres(swarm, {"U": Isotropic()}, w, {"U": body})
+    pieces = centres.with_centres(echo, ends | swarm.poses(0.0), 0.0)
+    assert np.abs(pieces.delay_rate[1:]).max() * w.carrier_frequency < 1e-6
+    assert np.ptp(pieces.delay[1:]) * w.carrier_frequency < 1e-3
+
+
+def test_ghosts_follow_the_centre_over_the_mirror():
+    """Delay and direction of an echo by way of a wall, from the radar's image. Planted bugs: the
+    mirror left out of the direction; of the image's velocity."""
+    w = irt.Waveform(num_chirps=6, num_groups=1)
+    radar = Pose(np.zeros(3), np.array([2.0, 5.0, 0.0]), np.zeros(3), np.eye(3))
+    uav = np.array([3.0, 20.0, 4.0])
+    image = np.array([20.0, 0.0, 0.0])  # over the wall x = 10
+    share = (10 - uav[0]) / (image[0] - uav[0])
+    hit = uav + share * (image - uav)
+    there, back = np.linalg.norm(uav - image), np.linalg.norm(uav)
+    swarm = Swarm({"U": Uav(role="target", position_m=tuple(uav))})
+    ghost = make_paths(
+        gain=[1.0],
+        delay=[(there + back) / SPEED_OF_LIGHT],
+        departure=[hit / np.linalg.norm(hit)],
+        arrival=[uav / back],
+        tx_radius=[there],
+        rx_radius=[back],
+        kind=PathKind.GHOST,
+        target=0,
+        bounces=1,
+        points=[[hit, uav]],
+        faces=[[7, -1]],
+        tx="A",
+        rx="A",
+        epoch=0.0,
+        target_names=("U",),
+    )
+    body = circling(2 * np.pi * 50, 0.2)
+    centres = MovingCentres(swarm, {"U": Isotropic()}, w, {"U": body})
+    pieces = centres.with_centres(ghost, {"A": radar} | swarm.poses(0.0), 0.0)
+    time = centres.slots(0.0)[1]
+    for row, t in enumerate(time, start=1):
+        angle = 0.3 + 2 * np.pi * 50 * t
+        point = uav + 0.2 * np.array([np.sin(angle), np.cos(angle), 0.0])
+        at = radar.velocity * t
+        mirrored = image + at * [-1, 1, 1]
+        way = np.linalg.norm(point - mirrored) + np.linalg.norm(point - at)
+        # the path itself is given without rates: what its ends move is in the centre alone
+        still = np.linalg.norm(uav - mirrored) + np.linalg.norm(uav - at) - there - back
+        delay = pieces.delay[row] + (pieces.delay_rate[row] + pieces.delay_accel[row] * t / 2) * t
+        assert delay * SPEED_OF_LIGHT == pytest.approx(way - still, abs=1e-9)
+        leaves = (point - mirrored) * [-1, 1, 1] / np.linalg.norm(point - mirrored)
+        # the direction of the path at the epoch, turned by the centre and the image's motion
+        assert pieces.departure[row] == pytest.approx(leaves, abs=1e-6)
+        assert pieces.tx_radius[row] == pytest.approx(np.linalg.norm(point - mirrored))
+
+
+def test_the_second_order_leaves_out_what_it_says():
+    """Planted bug: `half**2` in `remainder`."""
+    speed, rate, half = 75.4, 2 * np.pi * 100, 32e-6
+    t = np.linspace(-half, half, 101)
+    radius = speed / rate
+    angle = np.linspace(0, 2 * np.pi, 400)[:, None]
+    exact = np.sin(angle + rate * t)
+    second = np.sin(angle) + np.cos(angle) * rate * t - np.sin(angle) * (rate * t) ** 2 / 2
+    error = 2 * radius * np.abs(exact - second).max() / SPEED_OF_LIGHT
+    assert 0.99 < remainder(speed, rate, half) / error < 1.01
+
+
+def test_paths_of_a_frame_are_the_bodys_own():
+    """What scores and draws sees no pieces. Planted bug: `with_centres` in `Setup.frame_of`."""
+    plain, rotors = (irt.prepare(scenario(rotors=r)).frame(0) for r in (None, {}))
+    for name, column in plain.paths[OWN].arrays().items():
+        assert np.array_equal(column, rotors.paths[OWN].arrays()[name], equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("uav", "said"),
+    [
+        ({"rotors": {"rev_per_min": 50_000}}, "faster than sound"),
+        ({"rotors": {}, "rcs": {"model": "relative"}}, "another rcs.model"),
+        ({"rotors": {"blade_length_m": 0}}, "greater than 0"),
+    ],
+)
+def test_refused(uav, said):
+    """Planted bug: `>` for `<` in `Rotors.problems`."""
+    with pytest.raises(ValueError, match=said):
+        scenario(**uav)
