@@ -150,6 +150,8 @@ EXTENSIONS = {
     "map_files": "isac_rt.extensions.city_files.tables:table_files",
     "map_buildings": "isac_rt.extensions.city_files.footprints:footprints",
     "flight_log": "isac_rt.extensions.flights.logs:flight_log",
+    "weather": "isac_rt.extensions.street.weather:Weathered",
+    "weather_plan": "isac_rt.extensions.street.weather:plan_rows",
     "antenna_pattern": "isac_rt.extensions.antenna_files.patterns:antenna_pattern",
     "moving_centres": "isac_rt.extensions.street.centres:moving_centres",
     "map_georeference": "isac_rt.extensions.city_files.footprints:located",

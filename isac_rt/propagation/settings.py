@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
 from isac_rt.registry import PROPAGATION_MODELS
-from isac_rt.settings import Decibels, Loss, Node, Positive, Problem
+from isac_rt.settings import Decibels, Loss, Node, Positive, Problem, Vector
 
 
 class Leakage(Node):
@@ -49,6 +50,37 @@ class Propagation(Node):
     leakage: Leakage = Leakage()
     """What a terminal's receiver receives of its own transmitter; it covers what is very near. The
     default is that of a board with separate antennas."""
+
+
+class Weather(Node):
+    """Air and rain on the paths, the same everywhere."""
+
+    rain_mm_per_h: Annotated[float, Field(ge=0, le=300, allow_inf_nan=False)] = 0.0
+    """Rain rate [mm/h]: it attenuates every path and scatters. 1 is drizzle, 10 steady rain, 50 a
+    cloudburst. The default is none."""
+    wind_mps: Vector = (0.0, 0.0, 0.0)
+    """Wind that carries the drops: east, north, up [m/s]. By default drops fall straight down."""
+    temperature_c: Annotated[float, Field(ge=-40, le=60, allow_inf_nan=False)] = 15.0
+    """Temperature of air and drops [degrees Celsius]. The default is ITU's."""
+    pressure_hpa: Annotated[float, Field(ge=300, le=1100, allow_inf_nan=False)] = 1013.25
+    """Pressure of the air, water vapour included [hPa]. The default is that at sea level."""
+    vapour_g_per_m3: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 7.5
+    """Density of water vapour [g/m^3], 12.8 at most at 15 degrees. The default is ITU's."""
+
+    def applies(self, name: str) -> bool:
+        return name != "wind_mps" or self.rain_mm_per_h > 0
+
+    def problems(self) -> Iterator[Problem]:
+        celsius = self.temperature_c
+        # Magnus' formula for the pressure [hPa] of saturated vapour, and its density
+        saturated = 6.112 * math.exp(17.62 * celsius / (243.12 + celsius))
+        most = 216.7 * saturated / (celsius + 273.15)
+        if self.vapour_g_per_m3 > 1.01 * most:
+            yield Problem(
+                (("vapour_g_per_m3",), ("temperature_c",)),
+                f"air of {celsius:g} degrees holds {most:.3g} g/m^3 at most; state as much or "
+                "less, or warmer air",
+            )
 
 
 class Clutter(Node):

@@ -29,7 +29,7 @@ from isac_rt import registry
 from isac_rt.frame.access import Access
 from isac_rt.frame.front_end import Elements, FrontEnd
 from isac_rt.frame.settings import Array, Modulation, Noise, RoleChange
-from isac_rt.propagation.settings import Clutter, Propagation
+from isac_rt.propagation.settings import Clutter, Propagation, Weather
 from isac_rt.receive.settings import Receivers
 from isac_rt.scenario.presets import Preset, ReceiverSet, with_preset
 from isac_rt.scenario.radio import Radio
@@ -98,6 +98,8 @@ class Scenario(Node):
     clutter: Clutter = Clutter()
     """What is received beside lines of sight, targets, ghosts and mirror images. By default
     nothing."""
+    weather: Weather | None = None
+    """Air and rain on the paths. null, the default: vacuum."""
     noise: Noise = Noise()
     """How strong the receiver's noise is: by a link budget, the default, or by a stated SNR."""
     receiver_preset: Preset | None = None
@@ -249,6 +251,7 @@ class Scenario(Node):
             self._block_problems,
             self._rcs_problems,
             self._clutter_problems,
+            self._weather_problems,
             self._detector_problems,
             self._initiation_problems,
             self._calibration_problems,
@@ -667,6 +670,11 @@ class Scenario(Node):
                 "field needs propagation.model ray_traced and a city to scatter from; "
                 "add them or set clutter.model to none",
             )
+
+    def _weather_problems(self) -> Iterator[Problem]:
+        if self.weather is not None and not 1e9 <= self.radio.carrier_hz <= 1e12:
+            said = "is known from 1 to 1000 GHz; leave it out, or give the carrier in hertz"
+            yield Problem((("weather",), ("radio", "carrier_hz")), said)
 
     def _detector_problems(self) -> Iterator[Problem]:
         for at, one in self._all_receivers().items():

@@ -23,16 +23,15 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.kernels.signal_gridded import GRIDDED_ERROR
 from isac_rt.propagation.clutter.cells import Density, error_for
 from isac_rt.propagation.clutter.merging import difference_db, resolution_cell
-from isac_rt.propagation.clutter.rayleigh import RayleighClutter
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.propagation.segments.geometry import plane_of_each_face, unfold
-from isac_rt.propagation.store import CachedPropagation
 from isac_rt.randomness import generator
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import power_map
 from isac_rt.receive.sense import window_gain
 from isac_rt.receive.spectrum import clean_spectrum
+from isac_rt.registry import extension
 from isac_rt.results.metrics import decibels
 from isac_rt.results.records import Use
 from isac_rt.signal.if_signal import if_signal
@@ -45,7 +44,7 @@ from isac_rt.simulation.plan import (
     frame_reach,
     next_slot_delay,
 )
-from isac_rt.simulation.setup import Frame, Setup
+from isac_rt.simulation.setup import Frame, Setup, link_budgets
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
@@ -93,10 +92,9 @@ def tracer_of(setup: Setup) -> RayTracer | None:
         return None
     from isac_rt.propagation.raytrace import RayTracer
 
-    model = setup.propagation
-    while isinstance(model, CachedPropagation | RayleighClutter):
+    model: Any = setup.propagation
+    while not isinstance(model, RayTracer):
         model = model.model
-    assert isinstance(model, RayTracer)
     return model
 
 
@@ -146,7 +144,7 @@ def _items(setup: Setup, frames: Sequence[int]) -> list[Item]:
         items += _link_items(setup, link, of_link)
     items += _unmodelled_items(setup, light, late, short_lived / len(frames))
     items += [] if setup.has_ideal_hardware else _hardware_items(last)
-    return items + _self_calibration_items(setup, last)
+    return items + _self_calibration_items(setup, last) + _weather_items(setup)
 
 
 def _next_slot(setup: Setup) -> float:
@@ -199,6 +197,14 @@ def _self_calibration_items(s: Setup, frame: Frame) -> list[Item]:
     said = f"elements, chirp and clocks ({s.scenario.receivers.self_calibration})"
     left = "coupling, patterns, oscillators"
     return [Item("self-calibration", said, left, link=str(link)) for link in frame.paths]
+
+
+def _weather_items(s: Setup) -> list[Item]:
+    """Return an item for each link budget in weather."""
+    if s.scenario.weather is None:
+        return []
+    rows = extension("weather_plan")(s.scenario.weather, s.waveform, link_budgets(s))
+    return [Item(**row) for row in rows]
 
 
 def missed_per_frame(setup: Setup, frames: Sequence[int]) -> float:

@@ -264,7 +264,12 @@ class Setup:
             arrays=arrays,
             reference=free,
             plan=plan,
-            propagation=_maker(self.scenario, plan, free, self.city, floor)(),
+            propagation=_in_weather(
+                self.scenario,
+                _maker(self.scenario, plan, free, self.city, floor)(),
+                free,
+                self.city,
+            ),
             expectation=_expectation_of(self.scenario, plan, free, self.believed_city),
         )
 
@@ -599,7 +604,7 @@ def _prepared(
         swarm,
         city,
         believed,
-        propagation,
+        _in_weather(scenario, propagation, free, city),
         free,
         timetable,
         Connections(),
@@ -617,6 +622,18 @@ def _maker(
     settings = scenario.propagation, scenario.clutter
     ground = Ground(*settings, plan.swarm, city, plan.waveform, free, plan.max_untraced, floor)
     return partial(make_propagation, ground)
+
+
+def _in_weather(
+    scenario: Scenario, model: Propagation, free: FreeSpace, city: CityMesh
+) -> Propagation:
+    """Return a propagation model with the scenario's weather."""
+    if scenario.weather is None:
+        return model
+    waveform = waveform_of(scenario.radio, scenario.array)
+    hiding = city if scenario.propagation.model == "ray_traced" else None
+    wet: Propagation = extension("weather")(scenario.weather, model, free, waveform, hiding)
+    return wet
 
 
 def _expectation_of(
@@ -761,7 +778,8 @@ def propagation_in(city: CityMesh, scenario: Scenario, sample_spacing: float = 0
     waveform, swarm = waveform_of(scenario.radio, scenario.array), swarm_of(scenario)
     free = FreeSpace(swarm.uavs, arrays_of(scenario, waveform), waveform.wavelength, scenario.seed)
     settings = scenario.propagation, scenario.clutter
-    return make_propagation(Ground(*settings, swarm, city, waveform, free, sample_spacing))
+    model = make_propagation(Ground(*settings, swarm, city, waveform, free, sample_spacing))
+    return _in_weather(scenario, model, free, city)
 
 
 def trace(scenario: Scenario, frame: int, *, setup: Setup | None = None) -> dict[Link, PathSet]:
