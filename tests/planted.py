@@ -306,8 +306,8 @@ OF_CASES = {
     ),
     "spherical waves": Bug(
         "signal/tones.py",
-        "square - 2 * far * along[some]",
-        "0 * square - 2 * far * along[some]",
+        "square - 2 * far * along[chunk]",
+        "0 * square - 2 * far * along[chunk]",
     ),
     "clock errors": Bug("signal/tones.py", "moved + t.clock_offset", "moved - t.clock_offset"),
     "births and deaths": Bug(

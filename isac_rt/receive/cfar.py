@@ -1,13 +1,14 @@
-"""Constant-false-alarm-rate detection on accumulated maps, and the choice of peaks.
+"""Constant-false-alarm-rate (CFAR) detection on range-Doppler maps, and selection of peaks.
 
-A noise cell of a map that averages L channels is Gamma(L)/L; the mean of n independent training
-cells is Gamma(L n)/(L n). Greatest-of CFAR (Richards) takes the larger of the means before and
-behind the cell in range, which holds the false-alarm rate at clutter edges. With F the distribution
-of that larger mean z, the factor k solves
+In noise of unit power a cell of a map that averages the powers of L channels has the distribution
+Gamma(L)/L, and the mean of n independent training cells Gamma(L n)/(L n). Greatest-of CFAR
+(Richards) compares a cell with k times the larger of the means before and behind it in range, which
+holds the false-alarm rate at clutter edges. With F the distribution function of that larger mean z
+and g the density of Gamma(L), the factor k solves
 
-    P_fa = integral of P(cell > k z) dF(z) = integral of L k g(L k z) F(z) dz,                 (1)
+    P_fa = integral of P(cell > k z) dF(z) = integral of L k g(L k z) F(z) dz                  (1)
 
-g the density of Gamma(L); it is integrated numerically.
+(by parts); the integral is taken numerically.
 """
 
 from __future__ import annotations
@@ -26,19 +27,18 @@ HANN_CORRELATION = ((2 / 3) ** 2, (1 / 6) ** 2)
 """Correlation of the powers of cells one and two apart along a Hann-windowed axis."""
 
 QUADRATURE_POINTS = 4001
-
+"""Points of the integral (1)."""
 ROUNDING = 1e-16
 """Least background relative to the strongest cell: rounding of complex64 transforms leaves -170 dB
 of it at a quarter and half of the range axis."""
-
 STRONG, MAX_STRONG = 1e3, 8
-"""Least power over the median cell, and largest number, of peaks whose lobes are no training
-cells."""
+"""Least power over the median cell, and largest number, of the peaks whose sidelobes are excluded
+from the training cells."""
 DEEPEST_LOBE = 1e-8
-"""Least power of a lobe relative to its peak, reached 15 cells out: without noise the lobes would
-fill the map."""
+"""Least excluded sidelobe relative to its peak, 15 cells away; in a map without noise the sidelobes
+would fill every cell."""
 LOBE_MARGIN = 4.0
-"""Least power of a peak over the bound of a stronger path's sidelobes."""
+"""Least ratio of a peak to the bound of a stronger path's sidelobes at which it counts."""
 LEAST_KEPT = 0.25
 """Least share of a training block's cells for its mean to be used."""
 
@@ -122,8 +122,8 @@ class CfarRule:
 
     def background(self, power: np.ndarray, keep: np.ndarray) -> np.ndarray:
         """Return the greater of the means of the training cells before and behind each cell in
-        range, of the cells to `keep`; Doppler wraps. A block with too few cells is left out;
-        infinite without any."""
+        range, over the cells of the mask `keep`; Doppler wraps. A side with fewer than
+        `LEAST_KEPT` of its cells is left out; without both sides the background is infinite."""
         out = np.empty(power.shape)
         half = self.guard[1] + self.training[1]
         sides = self.side_rows(len(power))
@@ -177,7 +177,7 @@ def greatest_of_factor(
     before, behind : independent training cells on each side (may be fractions); 0 where a side is
         missing
     """
-    # z: range in which the greater mean lies; F(z): product of both distributions
+    # grid of z over all but 1e-12 of its distribution; F(z) is the product of both sides'
     sides = np.array([looks * n for n in (before, behind) if n > 0])  # shapes of Gamma means
     low = (special.gammaincinv(sides, 1e-12) / sides).min()
     high = (special.gammainccinv(sides, 1e-14) / sides).max()
@@ -211,26 +211,27 @@ def fill_background(
     a block counts if the cells to `keep` are at least a share `least` of it.
     """
     row, wide = np.arange(len(power)), 2 * half + 1
-    # sums over the bins about each cell, of powers and of kept cells; then cumulated over rows
+    # powers and cells to keep, summed over the bins of a block, then cumulated over rows
     bins = np.arange(-half, power.shape[1] + half) % power.shape[1]
-    kept = np.stack([np.where(keep, power, 0.0), keep]).astype(float)[..., bins]
-    about = np.lib.stride_tricks.sliding_window_view(kept, wide, axis=2).sum(axis=3)
+    masked = np.stack([np.where(keep, power, 0.0), keep]).astype(float)[..., bins]
+    about = np.lib.stride_tricks.sliding_window_view(masked, wide, axis=2).sum(axis=3)
     sums = np.pad(np.cumsum(about, axis=1), ((0, 0), (1, 0), (0, 0)))
     before, behind = sides.T
+    # mean of each side with enough cells; the greater one
     out[:] = -np.inf
     for first, rows in ((row - guard - before, before), (row + guard + 1, behind)):
         first = np.clip(first, 0, len(power))  # a side without rows may begin outside
         total, cells = sums[:, first + rows] - sums[:, first]
-        held = (cells >= least * rows[:, None] * wide) & (rows > 0)[:, None]
-        out[:] = np.maximum(out, np.where(held, total / np.maximum(cells, 1), -np.inf))
+        enough = (cells >= least * rows[:, None] * wide) & (rows > 0)[:, None]
+        out[:] = np.maximum(out, np.where(enough, total / np.maximum(cells, 1), -np.inf))
     out[out == -np.inf] = np.inf
 
 
 def strong_lobes(power: np.ndarray) -> np.ndarray:
-    """Mark the cells (rows, P) in which lobes of the strongest peaks exceed the median power.
+    """Mark the cells (rows, P) in which sidelobes of the strongest peaks exceed the median power.
 
-    A line of sight 60 dB over the noise would otherwise raise the background of all targets within
-    its training block. One row is added for range migration.
+    Sidelobes of a line of sight 60 dB over the noise would raise the background of targets many
+    cells away. They are taken to begin one row later, for range migration.
     """
     noise = float(np.median(power))
     rows, bins = peaks(power, power > STRONG * noise, (8, 8))
@@ -258,8 +259,9 @@ def peaks(
     """Return the cells above the threshold that are the largest within `reach` (range, Doppler)
     cells, strongest first; Doppler wraps."""
     rows, bins = np.nonzero(above)
-    near = (np.arange(-r, r + 1) for r in reach)
-    along, across = (at[:, None] + n for at, n in zip((rows, bins), near, strict=True))
+    # neighbours of each cell: rows end with the map, bins wrap
+    steps = (np.arange(-r, r + 1) for r in reach)
+    along, across = (at[:, None] + n for at, n in zip((rows, bins), steps, strict=True))
     along, across = np.clip(along, 0, len(power) - 1), across % power.shape[1]
     keep = power[along[:, :, None], across[:, None]].max(axis=(1, 2)) <= power[rows, bins]
     rows, bins = rows[keep], bins[keep]
@@ -270,8 +272,8 @@ def peaks(
 def strongest_peaks(
     power: np.ndarray, above: np.ndarray, settings: Receivers, floor: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return row and bin of peaks that are no sidelobes of a stronger one (`without_sidelobes`), at
-    most `max_detections`."""
+    """Return rows and bins of the strongest peaks that are no sidelobes of a stronger one
+    (`without_sidelobes`), at most `max_detections`."""
     rows, bins = peaks(power, above, (1, 1))
     keep = np.flatnonzero(without_sidelobes(rows, bins, power, power.shape[1], floor))[
         : settings.max_detections
@@ -285,8 +287,9 @@ def first_row(settings: Receivers, range_cell: float) -> int:
 
 
 def hann_envelope(distance: np.ndarray) -> np.ndarray:
-    """Return an upper bound of a Hann-windowed tone's power at `distance` [cells], over its peak: 1
-    in the main lobe, then the envelope 1/(pi d (1 - d^2))^2 of (sinc(d)/(1 - d^2))^2."""
+    """Return an upper bound of a Hann-windowed tone's power at `distance` d [cells], relative to
+    its peak: 1 in the main lobe, then 1/(pi d (1 - d^2))^2, the envelope of
+    (sinc(d)/(1 - d^2))^2."""
     d = np.maximum(np.abs(distance), 2.0)
     return np.where(np.abs(distance) < 2.0, 1.0, 1.0 / (np.pi * d * (d * d - 1)) ** 2)
 
@@ -303,20 +306,21 @@ def without_sidelobes(
 
     Parameters
     ----------
-    floor : sidelobe level in any Doppler bin of a path's range row, over its peak
-    margin : least power over the bound
+    floor : sidelobe level in every Doppler bin of a path's range row, relative to its peak
+    margin : least power relative to the bound
     """
     keep, values = np.ones(rows.size, bool), power[rows, bins]
     for i in range(1, rows.size):
         over = np.flatnonzero(keep[:i])
+        # against the sidelobes of every stronger peak that counts
         lobes = leaked(rows[i] - rows[over], bins[i] - bins[over], num_bins, floor)
         keep[i] = (values[i] > margin * values[over] * lobes).all()
     return keep
 
 
 def leaked(rows: np.ndarray, bins: np.ndarray, num_bins: int, floor: float) -> np.ndarray:
-    """Return the bound of a path's power at a distance of rows and bins, over its peak: Hann's
-    lobes, and `floor` in any Doppler bin."""
+    """Return the bound of a path's power at a distance of rows and bins, relative to its peak:
+    Hann's sidelobes on both axes, and `floor` in every Doppler bin."""
     bins = np.abs(bins)
     bins = np.minimum(bins, num_bins - bins)
     return hann_envelope(rows) * (hann_envelope(bins) + floor)

@@ -34,9 +34,11 @@ def exact(waveform: Waveform, tones: Tones) -> np.ndarray:
     -------
     samples : (M, L_rx, P, N) complex128
 
-    Notes ----- The gain of the filter is taken at the beat at mid-chirp and the arrays' centroids.
-    Its transient is not modelled, nor is the end of a received chirp with a negative beat, which
-    lies up to transition/slope before the end of the window (0.7 samples for 0.4 MHz).
+    Notes
+    -----
+    The gain of the filter is that at the beat at mid-chirp between the arrays' centroids. Not
+    modelled are its transient and the end of a received chirp with a negative beat, which lies up
+    to transition/slope before the end of the window (0.7 samples for 0.4 MHz).
     """
     w, t = waveform, tones
     out = np.zeros((w.num_groups, t.rx_delay.shape[1], w.num_chirps, w.num_samples), np.complex128)
@@ -44,11 +46,11 @@ def exact(waveform: Waveform, tones: Tones) -> np.ndarray:
         q = t.link[k]
         for m in range(w.num_groups):
             time = w.chirp_time[m][:, None] - w.frame_duration / 2 + w.fast_time
-            # delay of the path at each sample
+            # delay of the path at each sample, tau + tau' t + tau'' t^2/2, t from mid-frame
             path = t.delay[k] + t.rate[k] * time + t.accel[k] * time**2 / 2
             alive = (time >= t.begin[k]) & (time < t.end[k])
             for source in range(w.num_groups):
-                # with the data delay, from the chirp of transmit group `source`
+                # delay of transmit group `source`, sent m - source groups before the reference
                 base = path + t.symbol_delay[q, source][:, None] - (m - source) * w.group_spacing
                 passed = filter_gain(w, w.slope * base[:, w.num_samples // 2])
                 weight = (t.factor[k] * t.send[q, source] * passed)[:, None] * alive
@@ -58,13 +60,13 @@ def exact(waveform: Waveform, tones: Tones) -> np.ndarray:
                 if t.tx_gain.size:
                     weight = weight * t.tx_gain[k, antenna][:, None]
                 for rx in range(out.shape[1]):
-                    # with the delays of both elements, far field or spherical
+                    # from element to element, far field or spherical
                     element = (
                         t.tx_delay[k, antenna]
                         + t.rx_delay[k, rx]
                         + t.cross[t.cross_row[k], antenna, rx]
                     )
                     tau = base + element[:, None]
-                    own = t.rx_gain[k, rx] if t.rx_gain.size else 1.0
-                    out[m, rx] += own * weight * np.exp(2j * np.pi * w.phase(tau, w.fast_time))
+                    gain = t.rx_gain[k, rx] if t.rx_gain.size else 1.0
+                    out[m, rx] += gain * weight * np.exp(2j * np.pi * w.phase(tau, w.fast_time))
     return out

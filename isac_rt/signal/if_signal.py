@@ -28,11 +28,14 @@ def if_signal(
         s[m,l,p,n] = \sum A \beta_{m'p}\, \bar g\, h(\alpha\tau)\, e^{j2\pi(f_c\tau +
         \alpha\tau(u-\tau/2))}
 
-    over paths and transmit groups m', with tau = data delay + path delay + clock + 2 (b' + m' - b -
-    m) T_d + element delays, b' and b the first resource blocks of the
-    transmitter and of the receiver's reference; h is the IF filter. A farther target has a higher
-    fast-time frequency, a receding one a positive slow-time frequency; a wave from body direction u
-    has the phase factor exp(-j 2 pi f r.u/c) at element r.
+    over paths and transmit groups m', with the amplitude A, the DPSK phase beta, the conjugate path
+    gain, the IF filter h and the sum of delays
+
+        tau = path + data + element delays + clock offset + 2 (b' + m' - b - m) T_d,
+
+    b' and b the first resource blocks of the transmitter and of the receiver's reference. A farther
+    target has a higher fast-time frequency, a receding one a positive slow-time frequency; a wave
+    from body direction u has the phase factor exp(-j 2 pi f r.u/c) at element r.
 
     Parameters
     ----------
@@ -96,8 +99,8 @@ def noisy_if_signal(
     method: Method,
     noise: WhiteNoise,
 ) -> IFCube:
-    """Return `if_signal` with the noise of `add_noise`, bit for bit, added while samples are in
-    the cache."""
+    """Return the sum of `if_signal` and the noise of `add_noise`, bit for bit. The noise is added
+    while the samples are in the processor's cache."""
     schedule, tones = received_tones(waveform, links, receiver, reference)
     return IFCube(
         samples=method.samples(waveform, tones, noise),

@@ -42,8 +42,8 @@ def separable(waveform: Waveform, tones: Tones) -> np.ndarray:
     for k in range(t.size):
         q = t.link[k]
         for m in range(w.num_groups):
-            whole = start[k] + t.symbol_delay[q, m]  # tau_0 + data delay, by chirp
-            weight = t.factor[k] * t.send[q, m] * filter_gain(w, w.slope * whole)
+            with_data = start[k] + t.symbol_delay[q, m]  # tau_0 and data delay of each chirp
+            weight = t.factor[k] * t.send[q, m] * filter_gain(w, w.slope * with_data)
             # slow time: carrier phase of tau_0, of the transmit element and of the Doppler
             carrier = (
                 w.carrier_frequency
@@ -51,7 +51,7 @@ def separable(waveform: Waveform, tones: Tones) -> np.ndarray:
             ) % 1
             # fast time: beat frequency, f_tau + f_D
             beat = (
-                np.exp(2j * np.pi * ((w.slope * whole[:, None] * fast) % 1))
+                np.exp(2j * np.pi * ((w.slope * with_data[:, None] * fast) % 1))
                 * (weight * np.exp(2j * np.pi * carrier))[:, None]
             )
             out[m] += np.exp(2j * np.pi * w.carrier_frequency * t.rx_delay[k])[:, None, None] * beat
@@ -62,16 +62,16 @@ ERROR_AT_REST, ERROR_PER_SPEED = 5e-5, 1e-6
 """Bound of the relative RMS error of a gridded path at rest, and its increase per m/s of c/2 times
 the delay rate; up to direction cosines of 0.87 and 640 MHz (tests/signal/test_gridding.py)."""
 GRID_PATHS = 150
-"""Paths times blocks of 16 receive elements at which direct sums take as long as the grid (100 to
-250 by processor)."""
+"""Paths times blocks of 16 receive elements up to which direct sums are faster than the grid (100
+to 250 by processor)."""
 MAX_CELLS = 1 << 24
-"""Largest span of cells that is summed in one array, a hundred times that of a link. Clocks that
-differ by a second span 10^11."""
+"""Largest span of range-Doppler cells held in one array, a hundred times that of a link. Clocks
+that differ by a second span 10^11 cells, which are then numbered."""
 
 
 @dataclass(frozen=True)
 class Exact:
-    """Float64 sum per path and sample: the reference of the fast methods.
+    """Synthesis by a float64 sum per path and sample: the reference of the fast methods.
 
     Examples
     --------
@@ -114,7 +114,8 @@ class Separable:
 
 @dataclass(frozen=True)
 class Direct:
-    """Path by path in float32 sums: relative error 1e-6, time proportional to the paths."""
+    """Synthesis path by path in float32 sums: relative error 1e-6, time proportional to the number
+    of paths."""
 
     name: ClassVar[str] = "direct"
 
@@ -126,9 +127,9 @@ class Direct:
 
 @dataclass(frozen=True)
 class Gridded:
-    """Non-uniform FFT over a grid of beat frequencies, for many paths: relative error
-    `GRIDDED_ERROR`, or that of below-noise paths (`faint`:
-    `isac_rt.kernels.signal_below_noise.below_noise_error`)."""
+    """Synthesis by a non-uniform FFT over a grid of beat frequencies, for many paths: relative
+    error `GRIDDED_ERROR`, or with `faint` that of below-noise paths
+    (`isac_rt.kernels.signal_below_noise.below_noise_error`)."""
 
     name: ClassVar[str] = "gridded"
     faint: bool = False
@@ -141,21 +142,24 @@ class Gridded:
 
 @dataclass(frozen=True)
 class Auto:
-    """Choose a method for each path: `Direct` for few paths, else `Gridded` for most.
+    """Synthesis by a method for each path: `Direct` for few paths, else `Gridded` for most.
 
-    Paths that live for a slot at most are made directly. Of many others `Direct` makes lines of
-    sight (the grid omits their joint curvature), paths too fast for `GRIDDED_ERROR`, and the
-    `max_direct` strongest of those whose error, integrated coherently over the cube, could exceed
-    the noise of a cell (power error^2 size > noise_power). Below-noise paths take a faster grid
-    with a larger error: integrated likewise and summed over a range-Doppler cell, it stays under
-    `below_noise` times the noise.
+    Paths that exist for a slot at most are direct. Of many others `Direct` takes
+
+    - lines of sight, whose joint curvature the grid omits;
+    - paths too fast for `GRIDDED_ERROR`;
+    - the `max_direct` strongest of the paths whose error, integrated coherently over the cube,
+      could exceed the noise of a cell: power error^2 size > noise_power.
+
+    Below-noise paths take a faster grid with a larger error. Integrated coherently and summed over
+    a range-Doppler cell, that error stays below `below_noise` times the noise.
 
     Attributes
     ----------
-    noise_power : per complex sample [W]; with 0 the `max_direct` strongest paths are made directly
-    max_direct : most paths that are made directly for their power
-    below_noise : error of below-noise paths over the noise of a cell of all elements and chirps;
-        0: no path is below noise
+    noise_power : per complex sample [W]; with 0 the `max_direct` strongest paths are direct
+    max_direct : largest number of paths that are direct for their power
+    below_noise : largest error of below-noise paths relative to the noise of a cell of all elements
+        and chirps; 0: no path is below noise
     """
 
     name: ClassVar[str] = "auto"
@@ -168,7 +172,7 @@ class Auto:
         return _made(waveform, tones, noise, *self.choose(waveform, tones))
 
     def choose(self, waveform: Waveform, tones: Tones) -> tuple[np.ndarray, np.ndarray]:
-        """Mark the paths for `Direct`, and those of the others that are below noise: (K,) bool
+        """Mark the paths for `Direct`, and the below-noise paths among the others: (K,) bool
         each."""
         brief = signal_direct.lives_briefly(waveform, tones)
         if brief.any():
@@ -176,6 +180,7 @@ class Auto:
             alone[~brief], faint[~brief] = self.choose(waveform, tones.select(~brief))
             return alone, faint
         every, elements = np.ones(tones.size, bool), tones.rx_delay.shape[1]
+        # paths whose gridded error could exceed the noise
         size = float(np.prod(_shape(waveform, tones)))
         error = ERROR_AT_REST + ERROR_PER_SPEED * tones.speed(waveform.frame_duration)
         strong = tones.power * error**2 * size > self.noise_power
@@ -242,17 +247,18 @@ def add_up(
     alone: np.ndarray,
     faint: np.ndarray,
 ) -> None:
-    """Write the sum of all tones, and noise, to samples (M, L_rx, P, N); `alone` and `faint` say
-    how fast methods make each path (K,).
+    """Write the sum of all tones and the noise to samples (M, L_rx, P, N). The masks `alone` and
+    `faint` (K,) of `Auto.choose` matter to the kernels alone.
 
-    The phase f_c tau + alpha tau (u - tau/2) of `exact` goes to second order about the middle of
-    each chirp. Samples n = a + b are the product of a coarse and a fine tone, times
-    1 + j 4 pi c a b for the quadratic term c.
+    The phase f_c tau + alpha tau (u - tau/2) of `exact` is expanded about the middle of each chirp
+    to phase + step n + curvature n^2. With n = a + b, a in steps of 32, a sample is the product
+    of a coarse tone in a and a fine tone in b, and of 1 + j 4 pi curvature a b for the mixed term.
     """
     w, t, half = waveform, tones, waveform.num_samples // 2
     ts, u, a, b = w.sample_interval, w.fast_time[half], np.arange(-half, half, 32), np.arange(32)
     samples[:] = 0
     for m, p, source in np.ndindex(w.num_groups, w.num_chirps, w.num_groups):
+        # delay and delay rate at mid-chirp, amplitude; paths that exist and pass the filter
         time = w.chirp_time[m, p] + u - w.frame_duration / 2
         rate, symbol = t.rate + t.accel * time, t.symbol_delay[t.link, source, p]
         base = t.delay + (rate + t.rate) / 2 * time + symbol - (m - source) * w.group_spacing
@@ -261,12 +267,14 @@ def add_up(
         tx, rho, accel = t.antenna[t.link[k], source, p], rate[k], t.accel[k]
         weight = weight[k] * (t.tx_gain[k, tx] if t.tx_gain.size else 1.0)
         for rx in range(samples.shape[1] if k.size else 0):
+            # phase [cycles], its step and its curvature per sample
             joint = t.cross[t.cross_row[k], tx, rx]
             tau = base[k] + t.tx_delay[k, tx] + t.rx_delay[k, rx] + joint
             carrier = w.carrier_frequency + w.slope * (u - tau)
             phase = w.carrier_frequency * tau + w.slope * tau * (u - tau / 2)
             step = (carrier * rho + w.slope * tau) * ts
             curvature = (carrier * accel / 2 + w.slope * rho * (1 - rho / 2)) * ts**2
+            # sum over paths of coarse (a) times fine tones (b)
             strength = weight * (t.rx_gain[k, rx] if t.rx_gain.size else 1.0)
             coarse = np.exp(
                 2j * np.pi * (phase % 1 + np.outer(a, step) + np.outer(a**2, curvature))

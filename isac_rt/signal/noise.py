@@ -1,4 +1,4 @@
-"""White Gaussian noise of a receiver, drawn from a counter so that no sample depends on the order
+"""White Gaussian noise of a receiver from a counter-based generator: no sample depends on the order
 of work.
 
 Sample i of a stream is a pure function of (key, i): Threefry-2x32 with 20 rounds [1]_ makes two
@@ -40,7 +40,7 @@ class WhiteNoise(NamedTuple):
         return np.float32(self.power), np.uint32(first), np.uint32(second)
 
     def add_to(self, samples: np.ndarray) -> None:
-        """Add it in place to samples, complex64 and contiguous, from the stream's first on."""
+        """Add the noise in place to samples, complex64 and contiguous."""
         if self.power:
             add_white_noise(samples, *self)
 
@@ -56,18 +56,20 @@ def add_stream(
     out: np.ndarray, power: float, key0: np.uint32, key1: np.uint32, first: np.uint64
 ) -> None:
     """Add sample `first + i` of the stream to (out[2 i], out[2 i + 1]): Threefry-2x32 of the
-    counter, figure 2 of [1]_, and the transform of Box and Muller."""
+    counter, figure 2 of [1]_, and the Box-Muller transform."""
+    # counter and key schedule, the third key word by parity
     counter = np.uint64(first) + np.arange(out.size // 2, dtype=np.uint64)
     a, b = counter.astype(np.uint32), (counter >> np.uint64(32)).astype(np.uint32)
     keys = [np.uint32(key0), np.uint32(key1)]
     keys.append(keys[0] ^ keys[1] ^ np.uint32(_PARITY))
     a, b = a + keys[0], b + keys[1]
-    for group in range(5):  # of four rounds, after each of which the key is added anew
-        for places in _ROTATIONS[group % 2]:
+    for group in range(5):  # 20 rounds: add, rotate, exclusive or; a key after every four
+        for bits in _ROTATIONS[group % 2]:
             a = a + b
-            b = (b << np.uint32(places) | b >> np.uint32(32 - places)) ^ a
+            b = (b << np.uint32(bits) | b >> np.uint32(32 - bits)) ^ a
         a = a + keys[(group + 1) % 3]
         b = b + keys[(group + 2) % 3] + np.uint32(group + 1)
+    # Box-Muller: Rayleigh magnitude, uniform phase
     radius = np.sqrt(-power * np.log((a + 0.5) / 2**32))
     sample = radius * np.exp(2j * np.pi * b / 2**32)
     out[0::2] += sample.real.astype(out.dtype)
@@ -83,7 +85,7 @@ def add_white_noise(samples: np.ndarray, power: float, key: np.ndarray, first: i
         the stream
     power : E|n|^2 [W]; real and imaginary part have half of it each
     key : (2,) uint32, the stream; streams of different keys are independent
-    first : index of the first sample, so that parts of a cube can be filled one by one
+    first : index of the first sample in the stream, for parts of a cube
     """
     add_stream(
         samples.reshape(-1).view(np.float32), *WhiteNoise(power, key).numbers, np.uint64(first)

@@ -1,4 +1,4 @@
-"""Settings of how near to the full model a run has to come."""
+"""Settings of the accuracy of a run against the full model."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from isac_rt.settings import Node, Positive
 
 
 class Accuracy(Node):
-    """Required accuracy of a run against the full model. What the scene then needs is decided link
-    by link and frame by frame; `isac-rt plan` shows it."""
+    """Required accuracy of a run against the full model. `isac-rt plan` shows the approximations
+    that each link then uses."""
 
     REMOVED: ClassVar[dict[str, str]] = {
         "preset: fastest": "budget; with propagation.weakest_path_db: 0 it leaves out most",
@@ -21,17 +21,17 @@ class Accuracy(Node):
     }
 
     preset: Literal["budget", "everything"] = "budget"
-    """What may be left out. `budget`, the default: what the keys below and
-    `propagation.weakest_path_db` allow. `everything`: nothing is left out, rays search for walls in
-    every frame."""
+    """Approximations: `budget` (default) allows those of the keys below and of
+    `propagation.weakest_path_db`; `everything` allows none and traces rays in every frame. Use
+    `everything` to check a budget."""
     max_phase_error_rad: Positive = 0.05
-    """Bound of the phase error of plane wavefronts and straight flight together, at any element and
-    chirp [rad], for `budget`. Rotation within a frame is not modelled (`isac-rt plan` states it).
-    The default costs at most 0.01 dB."""
+    """Largest phase error of plane wavefronts and unaccelerated flight together, at any element and
+    chirp [rad], with `budget`. The default, 0.05, costs at most 0.01 dB. Rotation within a frame is
+    never modelled."""
     max_untraced_m: Annotated[float, Field(ge=0)] = 2.0
-    """Longest flight between two time samples, from which rays search for chains of walls [m], for
-    `budget`; 0: from every frame. A higher value is faster and may miss short-lived paths. The
-    default is shorter than walls are wide."""
+    """Longest flight between two searches for interaction sequences by rays [m], with `budget`; 0:
+    a search in every frame. The default, 2, is less than the width of a wall; higher values are
+    faster and may miss short-lived paths."""
 
     def applies(self, name: str) -> bool:
         return name == "preset" or self.preset == "budget"

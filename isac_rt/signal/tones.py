@@ -14,7 +14,8 @@ from isac_rt.propagation.pathset import PathKind, PathSet
 Links = Sequence[tuple[Transmission, PathSet]]
 """Transmissions, each with the paths from it to the receiver."""
 NO_GAIN = np.zeros((0, 0), complex)
-_CHUNK = 1024  # paths whose element delays stay in the second-level cache
+_CHUNK = 1024
+"""Paths whose element delays fit into the second-level cache."""
 
 
 class Tones(NamedTuple):
@@ -27,10 +28,10 @@ class Tones(NamedTuple):
     power : (K,) received power [W]
     factor : (K,) complex128, conj(path gain)
     delay, rate, accel : (K,) float64, the clock of the transmitter included
-    begin, end : (K,) interval in which the path exists
+    begin, end : (K,) interval in which the path exists [s]
     tx_delay, rx_delay : (K, L_tx), (K, L_rx) delay of each element [s]
     cross_row : (K,) int64 row of `cross`
-    cross : (R, L_tx, L_rx) joint part of the element delays [s]; row 0 is zero
+    cross : (R, L_tx, L_rx) part of a delay that depends on both elements jointly [s]; row 0 is zero
     symbol_delay : (Q, M, P) delay of the data [s]
     send : (Q, M, P) complex128, amplitude times DPSK phase, zero where nothing is sent
     antenna : (Q, M, P) int64 transmit element
@@ -75,10 +76,11 @@ class Tones(NamedTuple):
         )
 
     def sources(self, waveform: Waveform) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pairs (path, offset = m - m') that pass the filter in some chirp: indices of
-        the paths, and offsets, (C,) int64 each."""
+        """Return the pairs of a path and a group offset m - m' that pass the filter in some chirp:
+        indices of the paths and offsets, (C,) int64 each."""
         w, t = waveform, self
         half = w.frame_duration / 2 + w.chirp_duration + w.num_groups * w.group_spacing
+        # largest change of the delay by motion and data, against the band of the filter
         motion = np.abs(t.rate) * half + np.abs(t.accel) * half**2 / 2
         longest = float(t.symbol_delay.max(initial=0.0))
         margin = w.filter_transition / w.slope
@@ -100,8 +102,8 @@ class Tones(NamedTuple):
 def tones_of(
     waveform: Waveform, links: Links, receiver: ReceiveArray, middle: float, first_block: int
 ) -> Tones:
-    """Return the tones of all links at a receiver with mid-frame `middle` [s] and reference chirps
-    from resource block `first_block` on."""
+    """Return the tones of all links at a receiver whose frame has its middle at `middle` [s] and
+    whose reference chirps begin with resource block `first_block`."""
     w = waveform
     links = [(stream, paths) for sent, paths in links for stream in sent.streams()]
     rx = receiver.pose.to_world(receiver.antennas.rx_positions)
@@ -157,28 +159,29 @@ def tones_of(
 
 
 def _element_delay(elements: np.ndarray, direction: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Return (|R u - r| - R)/c, or -r.u/c for infinite R: (K, L) [s], without cancellation."""
+    """Return (|R u - r| - R)/c, or -r.u/c for infinite R: (K, L) [s]. With x = r^2 - 2 R r.u this
+    is x / (sqrt(R^2 + x) + R), without cancellation."""
     along = direction @ elements.T
     out = along * (-1 / SPEED_OF_LIGHT)
     square = (elements**2).sum(1)
     near = np.flatnonzero(np.isfinite(radius))
-    for some in np.split(near, range(_CHUNK, near.size, _CHUNK)):
-        far = radius[some, None]
-        change = square - 2 * far * along[some]
+    for chunk in np.split(near, range(_CHUNK, near.size, _CHUNK)):
+        far = radius[chunk, None]
+        change = square - 2 * far * along[chunk]
         distance = far**2 + change
         np.sqrt(distance, out=distance)
         distance += far
         change /= distance
         change /= SPEED_OF_LIGHT
-        out[some] = change
+        out[chunk] = change
     return out
 
 
 def _straight_delay(
     tx: np.ndarray, rx: np.ndarray, direction: np.ndarray, length: np.ndarray
 ) -> np.ndarray:
-    """Return (|L d + r_rx - r_tx| - L)/c of straight paths (K, L_tx, L_rx) [s], without
-    cancellation."""
+    """Return (|L d + r_rx - r_tx| - L)/c of straight paths (K, L_tx, L_rx) [s], written as in
+    `_element_delay`."""
     offset = rx[None, :] - tx[:, None]
     along = np.einsum("trx,kx->ktr", offset, direction)
     change = 2 * length[:, None, None] * along + (offset**2).sum(2)

@@ -1,11 +1,9 @@
-"""Error budget of a run: estimates before it from a few frames, and measured errors against the
-full model.
+"""Error budget of a run: estimates before it, and errors measured against the full model.
 
-Estimates come from `PILOT_FRAMES` frames, spread over the run, with a margin for the others, and
-are limited by the bounds of the plan. Errors are measured on other frames, drawn at random, by the
-full model: all paths, spherical wavefronts of all elements, the true positions at the ends of the
-frame, and direct synthesis. Missed paths are those that Sionna's own solver finds with `CHECK_RAYS`
-in addition."""
+Estimates are the largest values of `PILOT_FRAMES` frames spread over the run, times a margin, and
+at most the bounds of the plan. Errors are measured on frames drawn at random, against the full
+model: all paths, spherical wavefronts at all elements, true positions at the ends of the frame, and
+direct synthesis. Missed paths are those that only Sionna's solver finds, with `CHECK_RAYS`."""
 
 from __future__ import annotations
 
@@ -54,12 +52,15 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 PILOT_FRAMES = 5
+"""Frames that `make_plan` traces."""
 CHECK_RAYS = 300_000
+"""Rays of the check against Sionna's solver."""
 POWER_MARGIN = 10.0
 """Margin of power estimates over the largest of the pilot frames (3.2 in amplitude)."""
 PHASE_MARGIN = 2.0
+"""Margin of phase estimates over the largest of the pilot frames."""
 MOST_COMPARED = 150
-"""Most paths of a frame whose synthesis is compared with the direct one."""
+"""Largest number of paths of a frame whose synthesis is compared with the direct one."""
 SAME_DELAY = 1e-14
 """Largest difference of delay between equal paths of two traces [s]: 3 um, 5 mrad at 77 GHz."""
 
@@ -70,9 +71,9 @@ class Item:
 
     Attributes
     ----------
-    what : is modelled
-    modelled, left_out : in words
-    estimate : of the error, None where there is none
+    what : effect
+    modelled, left_out : parts of it in words
+    estimate : of the error; None without one
     unit : "rad", "dB" (power over the noise of a cell), "dB of a cell's mean", "dB of noise
         and clutter", "relative", "paths/frame", "of the power radiated" or "of a path's amplitude"
     link : "TX->RX", or "all"
@@ -105,17 +106,16 @@ def _spread(values: Sequence[int], count: int) -> list[int]:
 
 
 def make_plan(setup: Setup) -> dict[str, Any]:
-    """Return the plan of a run: its decisions, and one `Item` per effect with the estimated error.
-    Traces a few frames."""
+    """Trace `PILOT_FRAMES` frames and return the plan of a run: its decisions, and one `Item` per
+    effect with the estimated error."""
     frames = _spread(range(setup.timetable.frames), PILOT_FRAMES)
     items = []
-    for one in setup.each:
-        names = ", ".join(one.plan.timetable.blocks) if setup.by_chirp else "all"
-        found = _items(one, frames)
-        items += [replace(i, link=names) if i.link == "all" else i for i in found]
+    for part in setup.each:
+        names = ", ".join(part.plan.timetable.blocks) if setup.by_chirp else "all"
+        items += [replace(i, link=names) if i.link == "all" else i for i in _items(part, frames)]
     if setup.by_chirp:
-        said = "interference, where their bands overlap"
-        items.append(Item("chirps of other radars", "those of the same chirp", said))
+        left = "interference, where their bands overlap"
+        items.append(Item("chirps of other radars", "those of the same chirp", left))
     return {
         **setup.fidelity(),
         "coverage": asdict(setup.coverage),
@@ -127,22 +127,22 @@ def make_plan(setup: Setup) -> dict[str, Any]:
 def _items(setup: Setup, frames: Sequence[int]) -> list[Item]:
     """Return the items of the terminals of one chirp, from the paths of some frames."""
     uses: dict[Link, list[Use]] = {}
-    light, late, short_lived = 0.0, 0.0, 0
+    light, next_slot, short_lived = 0.0, 0.0, 0
     for frame in frames:
         _LOG.info("tracing frame %d, one of %d", frame, len(frames))
-        poses, found = setup.find(frame)
+        poses, traced = setup.find(frame)
         fastest = max(float(np.linalg.norm(pose.velocity)) for pose in poses.values())
-        last = setup.frame_of(frame, poses, found)
+        last = setup.frame_of(frame, poses, traced)
         for link, use in last.uses.items():
             uses.setdefault(link, []).append(use)
-            paths = found[link].select(found[link].power > 0)
+            paths = traced[link].select(traced[link].power > 0)
             light = max(light, flight_of_light(paths, setup.waveform, fastest))
-            late = max(late, _late(setup, paths, last.noise_power(link)))
+            next_slot = max(next_slot, _late(setup, paths, last.noise_power(link)))
             short_lived += int((np.isfinite(paths.begin) | np.isfinite(paths.end)).sum())
     items = [_tracing_item(setup, frames), *_scene_items(setup)]
     for link, of_link in uses.items():
         items += _link_items(setup, link, of_link)
-    items += _unmodelled_items(setup, light, late, short_lived / len(frames))
+    items += _unmodelled_items(setup, light, next_slot, short_lived / len(frames))
     items += [] if setup.has_ideal_hardware else _hardware_items(last)
     return items + _self_calibration_items(setup, last) + _weather_items(setup)
 
@@ -159,18 +159,20 @@ def _late(setup: Setup, paths: PathSet, noise_power: float) -> float:
     return power * setup.plan.cell_noise_gain(paths.tx) / noise_power
 
 
-def _unmodelled_items(setup: Setup, light: float, late: float, short_lived: float) -> list[Item]:
+def _unmodelled_items(
+    setup: Setup, light: float, next_slot: float, short_lived: float
+) -> list[Item]:
     """Return the items of effects that no run models: phases [rad], power over the noise of a cell,
     paths per frame."""
     limit = f"paths longer than {_next_slot(setup) * SPEED_OF_LIGHT:.0f} m"
     out = [
         Item("motion during the flight of light", "no", "always", light, "rad"),
-        Item("chirps that reach the next slot", "no", limit, decibels(late), "dB"),
+        Item("chirps that reach the next slot", "no", limit, decibels(next_slot), "dB"),
     ]
     if short_lived:
-        said = f"{short_lived:.3g} paths a frame begin or end in whole chirps"
+        modelled = f"{short_lived:.3g} paths a frame begin or end in whole chirps"
         share = 1 / (2 * setup.waveform.num_chirps)
-        out.append(Item("births and deaths", said, "half a chirp", share, "of a path's amplitude"))
+        out.append(Item("short paths", modelled, "half a chirp", share, "of a path's amplitude"))
     return out
 
 
@@ -180,7 +182,7 @@ def _hardware_items(frame: Frame) -> list[Item]:
     out = []
     for link in frame.paths:
         ends = frame.ends(link)
-        for part in dict.fromkeys(p for one in (ends.receiver, *ends.senders) for p in one.parts):
+        for part in dict.fromkeys(p for end in (ends.receiver, *ends.senders) for p in end.parts):
             left, error = "nothing", None
             if part == "oscillator":
                 left = "noise within a chirp of weak paths"
@@ -194,9 +196,9 @@ def _self_calibration_items(s: Setup, frame: Frame) -> list[Item]:
     """Return an item for each link with a self-calibrating receiver."""
     if s.scenario.receivers.self_calibration == "none":
         return []
-    said = f"elements, chirp and clocks ({s.scenario.receivers.self_calibration})"
+    modelled = f"elements, chirp and clocks ({s.scenario.receivers.self_calibration})"
     left = "coupling, patterns, oscillators"
-    return [Item("self-calibration", said, left, link=str(link)) for link in frame.paths]
+    return [Item("self-calibration", modelled, left, link=str(link)) for link in frame.paths]
 
 
 def _weather_items(s: Setup) -> list[Item]:
@@ -208,14 +210,15 @@ def _weather_items(s: Setup) -> list[Item]:
 
 
 def missed_per_frame(setup: Setup, frames: Sequence[int]) -> float:
-    """Estimate the missed paths per frame over `MATTERS_DB`, of all links, from some frames
+    """Estimate the missed paths per frame over `MATTERS_DB`, of all links, from a few frames: the
+    number found, times the share that only one half of the time samples finds
     (`isac_rt.simulation.plan`)."""
     tracer = tracer_of(setup)
     assert tracer is not None
     alone, weak, strong = 0, 0, 0
     for frame in frames:
-        poses, found = setup.find(frame)
-        when, links = setup.timetable.epoch(frame), list(found)
+        poses, traced = setup.find(frame)
+        when, links = setup.timetable.epoch(frame), list(traced)
         halves = [tracer.by_half(k).trace(poses, when, links).paths for k in (0, 1)]
         for link in links:
             level = setup.noise_power(poses, link) / setup.plan.cell_noise_gain(link.tx)
@@ -237,10 +240,11 @@ def _tracing_item(setup: Setup, frames: Sequence[int]) -> Item:
     if tracer is None:
         return Item("propagation", "closed forms", "the city")
     where = f"every {spacing:g} m of flight" if spacing else "each frame"
-    said = f"{setup.scenario.propagation.rays} rays for walls from {where}; images of each frame"
+    rays = setup.scenario.propagation.rays
+    modelled = f"{rays} rays for walls from {where}; images of each frame"
     missed = missed_per_frame(setup, frames)
     left = f"paths over {MATTERS_DB:g} dB over walls that no ray met"
-    return Item("tracing", said, left, missed, "paths/frame")
+    return Item("tracing", modelled, left, missed, "paths/frame")
 
 
 def _scene_items(setup: Setup) -> list[Item]:
@@ -254,14 +258,14 @@ def _scene_items(setup: Setup) -> list[Item]:
     if (count := record["scatterers"]) is not None:
         unseen = record["scatterer_cells"] - count
         density = f"{record['cell_area_per_metre_m']:.3g} m2 and metre from the flights"
-        said, why = f"{count} scatterers, one for {density}", "cells that no transmitter sees"
+        modelled, why = f"{count} scatterers, one for {density}", "cells that no transmitter sees"
         error, again = record["clutter_error_db"], record["overlap_m2"]
-        why += f"; {again:.0f} m2 that lie twice, for surfaces overlap" if again else ""
-        out.append(Item("clutter field", said, f"{unseen} {why}", error, "dB of a cell's mean"))
+        why += f"; overlapping surfaces of {again:.0f} m2" if again else ""
+        out.append(Item("clutter field", modelled, f"{unseen} {why}", error, "dB of a cell's mean"))
         for link, left in record["merged"].items():
-            below_noise = f"{count - left} merged under noise or out of sight"
-            kept, unit = f"{left} scatterers", "dB of noise and clutter"
-            out.append(Item("clutter of the link", kept, below_noise, error, unit, link))
+            below_noise = f"{count - left} merged below the noise or occluded"
+            merged, unit = f"{left} scatterers", "dB of noise and clutter"
+            out.append(Item("clutter of the link", merged, below_noise, error, unit, link))
         out.append(_mirrors_item(record["mirrors"]))
     return out
 
@@ -274,13 +278,14 @@ def _mirrors_item(record: dict[str, dict[str, Any]] | None) -> Item:
         return Item(what, "one bounce", "two bounces (clutter.mirrors)")
     counts = ", ".join(f"{row['count']} of {name}" for name, row in record.items())
     shares = [100 * row["share"] for row in record.values()]
-    kept = " to ".join(dict.fromkeys(f"{share:.2g}" for share in (min(shares), max(shares))))
-    said = (
-        f"mirrors {counts}: scatterers lit or received by way of one, {kept} % of what a terminal "
+    power = " to ".join(dict.fromkeys(f"{share:.2g}" for share in (min(shares), max(shares))))
+    modelled = (
+        f"mirrors {counts}: scatterers lit or received by way of one, {power} % of what a terminal "
         "radiates"
     )
     rest = max(row["share_left_out"] for row in record.values())
-    return Item(what, said, "weaker mirrors, more than one on a way", rest, "of the power radiated")
+    left = "weaker mirrors, paths over two"
+    return Item(what, modelled, left, rest, "of the power radiated")
 
 
 def _link_items(setup: Setup, link: Link, uses: list[Use]) -> list[Item]:
@@ -291,10 +296,10 @@ def _link_items(setup: Setup, link: Link, uses: list[Use]) -> list[Item]:
         for key in ("found", "filtered", "weak", "plane", "straight")
     }
     kinds = dict.fromkeys(kind for use in uses for kind in use.kept)
-    kept = ", ".join(
+    by_kind = ", ".join(
         f"{np.mean([use.kept.get(k, 0) for use in uses]):,.0f} {k.replace('_', ' ')}" for k in kinds
     )
-    said = f"{kept or 'none'}; bounces: {max(use.bounces for use in uses)} at most"
+    modelled = f"{by_kind or 'none'}; bounces: {max(use.bounces for use in uses)} at most"
     dropped = f"{mean['weak']:,.0f} too weak, {mean['filtered']:,.0f} out of reach"
     left = decibels(min(POWER_MARGIN * max(use.left_out for use in uses), setup.plan.weakest))
     num_kept = max(mean["found"] - mean["filtered"] - mean["weak"], 1.0)
@@ -306,7 +311,7 @@ def _link_items(setup: Setup, link: Link, uses: list[Use]) -> list[Item]:
     method = setup.plan.synthesis(int(num_kept))
     error = 1e-6 if isinstance(method, Direct) else GRIDDED_ERROR
     return [
-        Item("paths", said, dropped, left, "dB", name),
+        Item("paths", modelled, dropped, left, "dB", name),
         Item(
             "wavefronts",
             f"{num_kept - plane:,.0f} spherical",
@@ -340,7 +345,7 @@ def check(setup: Setup, frames: int = 4) -> dict[str, Any]:
     bound of these frames."""
     rng, count = generator(setup.scenario.seed, "budget check"), setup.timetable.frames
     chosen = sorted(rng.choice(count, min(frames, count), replace=False).tolist())
-    links = {name: row for one in setup.each for name, row in _measured(one, chosen).items()}
+    links = {name: row for part in setup.each for name, row in _measured(part, chosen).items()}
     return {"frames": chosen, "links": {name: _in_decibels(row) for name, row in links.items()}}
 
 
@@ -348,14 +353,14 @@ def _measured(setup: Setup, frames: Sequence[int]) -> dict[str, dict[str, float]
     """Return the largest errors and bounds of the links of one chirp in some frames."""
     tracer, out = tracer_of(setup), dict[str, dict[str, float]]()
     for number in frames:
-        poses, found = setup.find(number)
-        frame, truth = setup.frame_of(number, poses, found), found
+        poses, traced = setup.find(number)
+        frame, truth = setup.frame_of(number, poses, traced), traced
         if tracer is not None:
             epoch = setup.timetable.epoch(number)
-            truth = tracer.by_sionna(CHECK_RAYS).trace(poses, epoch, list(found)).paths
-        for link in found:
+            truth = tracer.by_sionna(CHECK_RAYS).trace(poses, epoch, list(traced)).paths
+        for link in traced:
             into = out.setdefault(str(link), {})
-            for key, value in _errors(setup, frame, link, found[link], truth[link]).items():
+            for key, value in _errors(setup, frame, link, traced[link], truth[link]).items():
                 into[key] = max(into.get(key, 0.0), value)
     return out
 
@@ -369,30 +374,30 @@ def _in_decibels(row: dict[str, float]) -> dict[str, float | None]:
 
 
 def _errors(
-    setup: Setup, frame: Frame, link: Link, found: PathSet, full: PathSet
+    setup: Setup, frame: Frame, link: Link, traced: PathSet, full: PathSet
 ) -> dict[str, float]:
     """Measure the errors of one link and frame; powers are over the noise of a cell."""
     plan, level = setup.plan, frame.noise_power(link)
-    kept, use = frame.paths[link], frame.uses[link]
+    paths, use = frame.paths[link], frame.uses[link]
     ratio = plan.cell_noise_gain(link.tx) / level
-    received, weak, _ = plan.chosen(found, level)
-    missed = ~present(full, found) & (full.delay <= plan.longest_delay)
-    delay = np.append(found.delay[weak], full.delay[missed])
+    received, weak, _ = plan.chosen(traced, level)
+    missed = ~present(full, traced) & (full.delay <= plan.longest_delay)
+    delay = np.append(traced.delay[weak], full.delay[missed])
     cell = np.floor(delay / setup.waveform.delay_step).astype(int)
-    power = np.append(found.power[weak], full.power[missed]) * ratio
+    power = np.append(traced.power[weak], full.power[missed]) * ratio
     lost = np.bincount(cell - cell.min(), power) if cell.size else np.zeros(1)
     return {
         "left_out": float(lost.max()),
         "left_out_bound": use.left_out,
         "missed_chains": float(missed.sum()),
         "missed_strongest": float((full.power[missed] * ratio).max(initial=0.0)),
-        "plane_rad": _plane_error(setup, frame, link, found.select(received & ~weak)),
+        "plane_rad": _plane_error(setup, frame, link, traced.select(received & ~weak)),
         "plane_bound_rad": use.plane_error,
         "clutter_db": _clutter_error(setup, frame, link),
         "clutter_bound_db": error_for(Density.of(setup.scenario.clutter).per_metre),
-        "flight_rad": _flight_error(setup, frame.number, kept),
+        "flight_rad": _flight_error(setup, frame.number, paths),
         "straight_bound_rad": use.straight_error,
-        "turning_rad": _turning_error(setup, frame.number, kept),
+        "turning_rad": _turning_error(setup, frame.number, paths),
         "turning_bound_rad": use.turning_error,
         "synthesis": _synthesis_error(setup, frame, link, level),
         "below_noise": _below_noise_error(setup, frame, link, level),
@@ -466,10 +471,12 @@ def clutter_by_cell(
     return resolution_cell(setup.waveform, *motion), power
 
 
-def cells_apart(every: tuple[np.ndarray, np.ndarray], some: tuple[np.ndarray, np.ndarray]) -> float:
+def cells_apart(
+    every: tuple[np.ndarray, np.ndarray], fewer: tuple[np.ndarray, np.ndarray]
+) -> float:
     """Return the 90th percentile of the difference of mean noise plus clutter between two results
     of `clutter_by_cell`, over cells with clutter [dB]."""
-    cells, powers = zip(every, some, strict=True)
+    cells, powers = zip(every, fewer, strict=True)
     _, number = np.unique(np.concatenate(cells), return_inverse=True)
     count = number.max(initial=-1) + 1
     if not count:
@@ -481,11 +488,11 @@ def cells_apart(every: tuple[np.ndarray, np.ndarray], some: tuple[np.ndarray, np
     return float(np.quantile(difference_db(a, b), 0.9))
 
 
-def _flight_error(setup: Setup, frame: int, kept: PathSet) -> float:
+def _flight_error(setup: Setup, frame: int, paths: PathSet) -> float:
     """Return the largest phase error of the extrapolated delays at the ends of the frame, against
     the true positions [rad]."""
     reach, epoch = frame_reach(setup.waveform), setup.timetable.epoch(frame)
-    moving = _with_chains(kept)
+    moving = _with_chains(paths)
     if not len(moving):
         return 0.0
     drift = []
@@ -496,27 +503,28 @@ def _flight_error(setup: Setup, frame: int, kept: PathSet) -> float:
     return float(2 * np.pi * setup.waveform.effective_carrier * error.max())
 
 
-def _with_chains(kept: PathSet) -> PathSet:
+def _with_chains(paths: PathSet) -> PathSet:
     """Select the paths whose delays `delays` can evaluate. Two-bounce clutter moves like a farther
     scatterer and is left out: one bounce is the worse case."""
-    there = (kept.kind != PathKind.DIFFUSE) | ((kept.faces >= 0).any(axis=1) & (kept.bounces == 1))
-    return kept.select(~kept.bent & (kept.kind != PathKind.LEAKAGE) & there)
+    one_bounce = (paths.faces >= 0).any(axis=1) & (paths.bounces == 1)
+    there = (paths.kind != PathKind.DIFFUSE) | one_bounce
+    return paths.select(~paths.bent & (paths.kind != PathKind.LEAKAGE) & there)
 
 
-def _turning_error(setup: Setup, frame: int, kept: PathSet) -> float:
+def _turning_error(setup: Setup, frame: int, paths: PathSet) -> float:
     """Return the largest phase error of constant directions within the frame [rad]: change of the
     element delays against those of the centroids at the ends of the frame, for all transmit
     elements with the first and last receive element."""
     reach, epoch = frame_reach(setup.waveform), setup.timetable.epoch(frame)
-    moving = _with_chains(kept)
+    moving = _with_chains(paths)
     if not len(moving):
         return 0.0
-    antennas, lags = setup.arrays.at(kept.link), []
+    antennas, lags = setup.arrays.at(paths.link), []
     for t in (0.0, -reach, reach):
         poses = setup.swarm.poses(epoch + t)
         centre = delays(moving, poses, setup.city)
-        tx = poses[kept.tx].to_world(antennas.tx_positions)
-        rx = poses[kept.rx].to_world(antennas.rx_positions[[0, -1]])
+        tx = poses[paths.tx].to_world(antennas.tx_positions)
+        rx = poses[paths.rx].to_world(antennas.rx_positions[[0, -1]])
         pairs = itertools.product(tx, rx)
         lags.append([delays(moving, poses, setup.city, pair) - centre for pair in pairs])
     error = np.abs(np.array(lags[1:]) - np.array(lags[0]))
@@ -570,13 +578,14 @@ def _lengths(faces: np.ndarray, start: Pose, end: Pose, city: CityMesh) -> np.nd
 def _synthesis_error(setup: Setup, frame: Frame, link: Link, level: float) -> float:
     """Return the relative RMS error of the run's synthesis on some of a frame's paths, below-noise
     paths excluded."""
-    kept = frame.paths[link]
-    if not len(kept):
+    paths = frame.paths[link]
+    if not len(paths):
         return 0.0
     rng = generator(setup.scenario.seed, "synthesis check", *link, frame.number)
-    some = kept.select(np.sort(rng.choice(len(kept), min(len(kept), MOST_COMPARED), replace=False)))
-    methods = Direct(), _uncovered(setup.plan.synthesis(len(kept), level))
-    exact, fast = (_made(setup, frame, link, some, method).samples for method in methods)
+    rows = rng.choice(len(paths), min(len(paths), MOST_COMPARED), replace=False)
+    sample = paths.select(np.sort(rows))
+    methods = Direct(), _uncovered(setup.plan.synthesis(len(paths), level))
+    exact, fast = (_made(setup, frame, link, sample, method).samples for method in methods)
     scale = float(np.linalg.norm(exact))
     return float(np.linalg.norm(fast - exact)) / scale if scale else 0.0
 
@@ -584,12 +593,12 @@ def _synthesis_error(setup: Setup, frame: Frame, link: Link, level: float) -> fl
 def _below_noise_error(setup: Setup, frame: Frame, link: Link, level: float) -> float:
     """Return the largest error power of below-noise paths in a range-Doppler cell, over its noise,
     with the errors of all channels in phase."""
-    kept = frame.paths[link]
-    if not len(kept) or not setup.plan.below_noise:
+    paths = frame.paths[link]
+    if not len(paths) or not setup.plan.below_noise:
         return 0.0
-    method = setup.plan.synthesis(len(kept), level)
-    cube = _made(setup, frame, link, kept, method)
-    cube.samples[:] -= _made(setup, frame, link, kept, _uncovered(method)).samples
+    method = setup.plan.synthesis(len(paths), level)
+    cube = _made(setup, frame, link, paths, method)
+    cube.samples[:] -= _made(setup, frame, link, paths, _uncovered(method)).samples
     passes = 2 if link.own else 1
     known = Known.of(cube, frame.sent[link.tx].payload, setup.arrays.at(link), passes)
     power = power_map(clean_spectrum(cube, known), known)

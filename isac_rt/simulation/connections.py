@@ -43,13 +43,13 @@ class Connections:
         tx, rx = link
         if sender == rx:
             return Clock()
-        one, other = self.clocks.get(sender, Clock()), self.clocks.get(rx, Clock())
-        offset, drift = one.late(time) - other.late(time), one.drift - other.drift
-        known = (
+        sent, received = self.clocks.get(sender, Clock()), self.clocks.get(rx, Clock())
+        offset, drift = sent.late(time) - received.late(time), sent.drift - received.drift
+        estimate = (
             None if self.establishment is None or tx == rx else self.establishment.links[link].clock
         )
-        if known is not None:
-            offset, drift = offset - known.offset_at(time), drift - known.drift
+        if estimate is not None:
+            offset, drift = offset - estimate.offset_at(time), drift - estimate.drift
         return Clock(offset, drift)
 
     def offset_std(self, link: Link, time: float) -> float:

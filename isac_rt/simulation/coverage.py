@@ -1,11 +1,11 @@
-"""Coverage of a radar: ranges, velocities and angles link by link, and what of the swarm lies
-outside them in how many frames.
+"""Coverage of a radar: limits in range, velocity and angle by link, and frames in which UAVs are
+outside them.
 
-A receiver's maps hold N/2 range cells, or all N of a plain radar. What lies within them arrives in
-every chirp, whatever its data symbol; half a cell farther a passive terminal finds no line of sight
-and loses every symbol. From there to N cells the IF filter lets pass the chirps whose symbol is
-small enough, and beyond N cells (the delay T_d) none. Shadows of the city are not counted here:
-they are known when its paths are traced. Clocks are taken to agree.
+A receiver's maps hold N/2 range cells, or all N of a plain radar. Paths within them pass the IF
+filter in every chirp, for any data symbol; half a cell farther a passive terminal finds no line of
+sight and loses every symbol. From there to N cells the filter passes only chirps with small enough
+symbols, and beyond N cells (the delay T_d) none. Occlusion by the city is not considered: it is
+known only after tracing. Clocks are assumed to agree.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from isac_rt.receive.settings import Receivers
 from isac_rt.world.swarm import Swarm
 
 MOST_FRAMES = 1_000
-"""Of longer runs so many frames are looked at, evenly spread."""
+"""Largest number of frames that are tested; longer runs are sampled evenly."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,19 +35,18 @@ class LinkCoverage:
     Attributes
     ----------
     link : "TX->RX"
-    slot_s, frame_s : what a chirp of each group lasts, and a frame
-    max_range_m : of an echo, one way, at an active terminal; of a path's whole length at a passive
-        one: what every chirp carries and the maps hold, with data and without
-    filtered_range_m : beyond it the IF filter stops the path in every chirp
-    min_range_m : nearer detections are left out, the line of sight of pilots among them
+    slot_s, frame_s : duration of a chirp of each group, and of a frame
+    max_range_m : largest range of the maps, with data and without: one way for an echo at an active
+        terminal, the length of a path at a passive one
+    filtered_range_m : range beyond which the IF filter stops a path in every chirp
+    min_range_m : range below which detections are discarded, lines of sight of pilots included
     range_resolution_m, velocity_resolution_mps : one cell of the map
-    max_velocity_mps : beyond it a velocity is reported a whole period off
+    max_velocity_mps : unambiguous velocity; faster ones are reported a period off
     azimuth_resolution_deg, elevation_resolution_deg : wavelength over aperture, at broadside; None
         where the array does not observe them
     field_of_view_deg : to each side of the boresight
-    unambiguous_angle_deg : to each side; beyond it a direction is reported on the other side
-    bit_rate_bps : sent for this receiver over the whole run, pilots and pauses included; None for
-        echoes
+    unambiguous_angle_deg : to each side; directions beyond it alias
+    bit_rate_bps : mean over the run, pilots and pauses included; None for echoes
     """
 
     link: str
@@ -68,16 +67,16 @@ class LinkCoverage:
 
 @dataclass(frozen=True, kw_only=True)
 class Outside:
-    """Frames in which a UAV is not seen on a link, each counted under its first cause.
+    """Numbers of frames in which a UAV is outside the coverage of a link, by the first cause.
 
     Attributes
     ----------
     link : "TX->RX"
-    uav : what reflects, or the transmitter itself, whose line of sight carries the data
-    frames : looked at
-    out_of_view : of the field of view of the receiver or of the transmitter
-    beyond_range, too_near : than `LinkCoverage.max_range_m` and `min_range_m`
-    too_fast : for `LinkCoverage.max_velocity_mps`; it is seen, at another velocity
+    uav : reflector, or the transmitter, whose line of sight carries the data
+    frames : tested
+    out_of_view : outside the field of view of the receiver or of the transmitter
+    beyond_range, too_near : outside `LinkCoverage.max_range_m` or `min_range_m`
+    too_fast : over `LinkCoverage.max_velocity_mps`: detected at an aliased velocity
     """
 
     link: str
@@ -90,13 +89,14 @@ class Outside:
 
     @property
     def unseen(self) -> int:
-        """Frames without a detection to hope for."""
+        """Number of frames in which no detection is possible."""
         return self.out_of_view + self.beyond_range + self.too_near
 
 
 @dataclass(frozen=True, kw_only=True)
 class Coverage:
-    """All that `coverage` finds; `outside` has a row only for what is outside in some frame."""
+    """Coverage of all links, with the time scales of a run; `outside` has the rows with a frame
+    outside."""
 
     frame_interval_s: float
     links: tuple[LinkCoverage, ...]
@@ -127,8 +127,8 @@ def coverage(
         here = np.array([link in of_frame for of_frame in received])
         seen = _link_coverage(link, timetable, arrays.at(link), receivers, schedule)
         links.append(seen)
-        own = {name: flight.at(here) for name, flight in flights.items()}
-        rows = (_outside(link, name, own, arrays, seen) for name in own if name != link.rx)
+        flown = {name: flight.at(here) for name, flight in flights.items()}
+        rows = (_outside(link, name, flown, arrays, seen) for name in flown if name != link.rx)
         outside += [row for row in rows if row.unseen or row.too_fast]
     return Coverage(
         frame_interval_s=timetable.interval,
@@ -140,8 +140,8 @@ def coverage(
 def unambiguous_velocity(
     link: Link, timetable: Timetable, velocity_method: str, schedule: str
 ) -> float:
-    """Largest radial speed that a link reports as it is [m/s]: that of a chirp in every slot, and
-    divided by the transmit antennas where each is looked at alone and sends at equal distances."""
+    """Return the largest unambiguous radial speed of a link [m/s]: that of one chirp per slot,
+    divided by the number of transmit antennas if each is processed alone and sends periodically."""
     w = timetable.waveform
     if not w.carries_data:
         return w.max_velocity(link.passes) * unambiguous_share(w)
@@ -205,13 +205,14 @@ def _flights(swarm: Swarm, epochs: list[float]) -> dict[str, _Flight]:
     out = {}
     for name, flight in swarm.trajectories.items():
         poses = [flight.pose(t) for t in epochs]
-        each = [[p.position, p.velocity, p.rotation] for p in poses]
-        out[name] = _Flight(*(np.array(values) for values in zip(*each, strict=True)))
+        states = [[p.position, p.velocity, p.rotation] for p in poses]
+        out[name] = _Flight(*(np.array(values) for values in zip(*states, strict=True)))
     return out
 
 
 def _segment(start: _Flight, end: _Flight, antennas: Antennas) -> tuple[np.ndarray, ...]:
-    """Length (T,), its rate, and whether the end is in the view of the start."""
+    """Return the length (T,) of the segment between two UAVs, its rate, and a mask of the frames in
+    which the end is in the field of view of the start."""
     offset = end.position - start.position
     length = np.linalg.norm(offset, axis=1)
     towards = offset / length[:, None]
@@ -229,7 +230,7 @@ def _outside(
     elif not link.own:
         first, first_rate, lit = _segment(tx, uav, arrays.of(link.tx))
         length, rate, in_view = length + first, rate + first_rate, in_view & lit
-    half = of.range_resolution_m / 2  # a path is looked for in the row that is nearest
+    half = of.range_resolution_m / 2  # a path belongs to the nearest row
     far, near = length >= of.max_range_m - half, length < of.min_range_m - half
     return Outside(
         link=of.link,

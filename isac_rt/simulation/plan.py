@@ -1,4 +1,4 @@
-r"""The error budget: effects that each link and frame needs, with bounds of those omitted.
+r"""Error budget: the effects that each link and frame needs, and bounds of those omitted.
 
 Phases. Two approximations change the phase of a path; each may use half of
 ``accuracy.max_phase_error_rad``:
@@ -10,15 +10,16 @@ Phases. Two approximations change the phase of a path; each may use half of
   chirp of the frame.
 
 Omitted paths. Paths that the IF filter stops in all groups, chirps and symbols are omitted without
-error. Of ghosts and paths of the city the weakest are omitted as long as their power per range cell
-stays ``propagation.weakest_path_db`` below the noise of a range-Doppler-antenna cell; powers add on
-average, whatever the phases. Interaction sequences that no ray hits are missed
+error. The weakest ghosts and paths of the city are omitted while their power per range cell stays
+``propagation.weakest_path_db`` below the noise of a range-Doppler-antenna cell; on average powers
+add, whatever the phases. Interaction sequences that no ray hits are missed
 (`isac_rt.propagation.segments.chains`); the others have no error.
 
-The share of missed paths is estimated by the share that only the even or only the odd time samples
-find. The second half of the rays adds half of that number; all further rays are assumed to add
-twice as much. Capture-recapture underestimates tenfold here: hit probabilities span decades. The
-share is that of all paths over `COUNTS_DB`, because those over `MATTERS_DB` are too few.
+Missed paths. The even and the odd time samples are two searches with half of the rays each; the
+second adds half of the paths that only one of them finds. All further rays are assumed to add twice
+as much, so the share of missed paths is the share that only one search finds. (Capture-recapture
+underestimates tenfold here: hit probabilities span decades.) The share is that of all paths over
+`COUNTS_DB`, because those over `MATTERS_DB` are too few.
 
 Never modelled: change of directions within a frame (`turning_bound`, not part of
 ``accuracy.max_phase_error_rad``), jerk, motion during the flight of light, and chirps that reach
@@ -212,27 +213,27 @@ class Plan:
         """
         w, antennas = self.waveform, self.arrays.at(paths.link)
         received, weak, left_out = self.chosen(paths, noise_power)
-        kept = paths.select(received & ~weak)
-        plane_error, straight_error = plane_bound(kept, antennas, w), straight_bound(kept, w)
+        needed = paths.select(received & ~weak)
+        plane_error, straight_error = plane_bound(needed, antennas, w), straight_bound(needed, w)
         plane, straight = plane_error <= self.phase_share, straight_error <= self.phase_share
         use = Use(
             found=len(paths),
             filtered=int((~received).sum()),
             weak=int(weak.sum()),
-            kept={name: count for name, count in kept.counts().items() if count},
-            bounces=int(kept.bounces.max(initial=0)),
+            kept={name: count for name, count in needed.counts().items() if count},
+            bounces=int(needed.bounces.max(initial=0)),
             left_out=left_out,
             plane=int(plane.sum()),
             straight=int(straight.sum()),
             plane_error=float(plane_error[plane].max(initial=0.0)),
             straight_error=float(straight_error[straight].max(initial=0.0)),
-            turning_error=float(turning_bound(kept, antennas, w, self.swarm).max(initial=0.0)),
+            turning_error=float(turning_bound(needed, antennas, w, self.swarm).max(initial=0.0)),
         )
         left = replace(
-            kept,
-            tx_radius=np.where(plane, np.inf, kept.tx_radius),
-            rx_radius=np.where(plane, np.inf, kept.rx_radius),
-            delay_accel=np.where(straight, 0.0, kept.delay_accel),
+            needed,
+            tx_radius=np.where(plane, np.inf, needed.tx_radius),
+            rx_radius=np.where(plane, np.inf, needed.rx_radius),
+            delay_accel=np.where(straight, 0.0, needed.delay_accel),
         )
         return left, use
 
@@ -260,8 +261,8 @@ def faintest(power: np.ndarray, cell: np.ndarray, limit: float) -> tuple[np.ndar
     -------
     mask : (K,) bool
     most : largest omitted sum of a cell"""
-    some = np.flatnonzero(power <= limit)
-    order = some[np.lexsort([power[some], cell[some]])]
+    weak = np.flatnonzero(power <= limit)
+    order = weak[np.lexsort([power[weak], cell[weak]])]
     sums, cells = np.cumsum(power[order]), cell[order]
     starts = np.flatnonzero(np.diff(cells, prepend=cells[:1] - 1))
     before = np.where(starts > 0, sums[starts - 1], 0.0) if starts.size else sums
@@ -315,13 +316,13 @@ def turning_bound(
         (paths.rx, paths.tx, antennas.rx_positions, paths.rx_radius),
     )
     out = np.zeros(len(paths))
-    for own, other, positions, radius in ends:
-        flight = swarm.trajectories[own]
-        here = poses[own].to_world(positions)
+    for end, far_end, positions, radius in ends:
+        flight = swarm.trajectories[end]
+        here = poses[end].to_world(positions)
         then = [flight.pose(paths.epoch + later).to_world(positions) for later in (-t, t)]
         r = float(np.linalg.norm(positions, axis=1).max())
-        flown = flown_distance[own] + np.where(paths.target >= 0, targets, flown_distance[other])
-        flown = np.where(paths.kind == PathKind.DIFFUSE, flown_distance[own], flown)
+        flown = flown_distance[end] + np.where(paths.target >= 0, targets, flown_distance[far_end])
+        flown = np.where(paths.kind == PathKind.DIFFUSE, flown_distance[end], flown)
         rest = radius - flown - r
         # beside the UAV itself a direction may turn to the opposite one
         out += k * np.where(rest > flown / 2, r * flown / np.maximum(rest, flown / 2), 2 * r)
@@ -393,13 +394,12 @@ def extent(city: CityMesh, census: Census, clutter: Clutter) -> dict[str, Any]:
 
     Returns
     -------
-    record : area of a scatterer over its distance [m] and the error of the mean power that this
-        brings, None without a field; faces traced; faces beyond the reach of all links and frames
-        (`Plan.mesh_radius`); scatterers in sight of a transmitter, None without a field, cells of
-        the whole mesh among which they were, and by link what is left of them where noise covers
-        the rest; by terminal the mirrors of two-bounce clutter and
-        the shares of its power that they and all others send on, None without mirrors; area in
-        sight that lies in two surfaces [m^2]
+    record : area of a scatterer over its distance [m] and its error of the mean power, None without
+        a field; faces traced; faces beyond the reach of all links and frames (`Plan.mesh_radius`);
+        scatterers visible from a transmitter, None without a field, out of cells of the whole mesh,
+        and by link their number after merging below the noise; by terminal the mirrors of
+        two-bounce clutter and the shares of power that they and all others reflect, None without
+        mirrors; visible area that lies in two surfaces [m^2]
     """
     area = Density.of(clutter).per_metre if clutter.model == "field" else None
     return {

@@ -29,7 +29,7 @@ from isac_rt.world.swarm import Pose, Swarm
 
 SAMPLE_BYTES = 8
 RECORD_BYTES = 2e4
-"""What is kept of a link's frame, measured: 4 kB with few detections and tracks."""
+"""Bound of the record of a link's frame; measured: 4 kB with few detections and tracks."""
 PROGRAM_BYTES = 4e8
 """Interpreter, libraries and a small city, measured: 0.35 GB after the first frame of
 scenes/paper_swarm.yaml."""
@@ -63,7 +63,7 @@ def check_memory(arrays: Arrays, timetable: Timetable) -> None:
 
     Raises
     ------
-    ScenarioError  With the estimate and what is free.
+    ScenarioError  With the estimate and the free memory.
     """
     free, links = available_memory(), len(timetable.all_links)
     at_work = receivers_at_work()
@@ -183,19 +183,19 @@ def check_reach(settings: City | None, city: CityMesh, reach: float) -> None:
     if settings is None or not city.num_faces or city.within(reach).num_faces:
         return
     low, high = city.bounds() + city.origin
-    said = (
+    message = (
         f"city: nothing of {city.name} is within {reach:.0f} m of the middle of the flights, "
         f"{_said(city.origin)} m; it reaches from {_said(low)} to {_said(high)} m"
     )
     if ((low <= city.origin) & (city.origin <= high))[:2].all():
-        return _warn(f"{said}; fly lower")
+        return _warn(f"{message}; fly lower")
     point, where = np.append((low + high)[:2] / 2, low[2]), ""
     if settings.source == "mesh":
         where = _said(point_in_file(settings, Path(settings.file or ""), point))
     elif city.georeference is not None:
         where = str(list(local_origin(city.georeference, point)))
     origin = "state the point of the file that becomes the world's origin, such as city.origin: "
-    raise ScenarioError(f"{said}; {f'{origin}{where}, or ' if where else ''}move the swarm")
+    raise ScenarioError(f"{message}; {f'{origin}{where}, or ' if where else ''}move the swarm")
 
 
 def _off_the_ends(polyline: np.ndarray) -> np.ndarray:
@@ -245,14 +245,14 @@ def warn_of_aliases(
                 )
 
 
-def _closing(own: Pose, other: Pose, ends: list[Antennas]) -> float:
+def _closing(pose: Pose, other_pose: Pose, ends: list[Antennas]) -> float:
     """Return the range rate of another UAV [m/s]; 0 outside the field of view of the antennas at
     the one end, or at both ends."""
-    line = other.position - own.position
+    line = other_pose.position - pose.position
     line = line / np.linalg.norm(line)
-    towards = own.to_body(line), other.to_body(-line)
+    towards = pose.to_body(line), other_pose.to_body(-line)
     seen = all(end.in_view(u) for end, u in zip(ends, towards, strict=False))
-    return float((other.velocity - own.velocity) @ line) if seen else 0.0
+    return float((other_pose.velocity - pose.velocity) @ line) if seen else 0.0
 
 
 def warn_of_interference(
@@ -270,7 +270,7 @@ def warn_of_interference(
 
     Parameters
     ----------
-    city : whose surfaces block direct paths
+    city : surfaces that block direct paths
     budget : amplitude of one transmit antenna of each terminal [sqrt(W)], and the noise power of a
         sample by poses and link [W]
     """
@@ -291,7 +291,7 @@ def warn_of_interference(
                     most[tx, rx] = over, power, float(np.linalg.norm(ends[1] - ends[0])), frame
     if not most:
         return
-    (tx, rx), (over, power, distance, frame) = max(most.items(), key=lambda one: one[1][0])
+    (tx, rx), (over, power, distance, frame) = max(most.items(), key=lambda item: item[1][0])
     more = f"; {len(most) - 1} more such paths" if len(most) > 1 else ""
     low, top = w.carrier_frequency / 1e9, (w.carrier_frequency + w.slope * w.chirp_duration) / 1e9
     share = 100 * min(w.max_delay / w.slot_duration, 1.0)

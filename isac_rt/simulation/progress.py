@@ -1,4 +1,4 @@
-"""Progress of a run that is shown unasked: a bar on a terminal or in a notebook."""
+"""Progress bar of a run, on a terminal or in a notebook."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ Progress = Callable[[int, int], None]
 
 @contextmanager
 def followed(progress: Progress | bool | None, total: int) -> Iterator[Progress | None]:
-    """Yield what is to be called after every frame; True stands for a bar, which goes at the end,
-    and for nothing where neither a terminal nor a notebook shows it."""
+    """Yield the function to be called after every frame. True: a bar on a terminal or in a
+    notebook, removed at the end, and None elsewhere."""
     if progress is not True:
         yield progress or None
         return

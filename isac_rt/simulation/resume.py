@@ -35,7 +35,7 @@ TABLES = {
     "entry": "(id INTEGER PRIMARY KEY, tree TEXT, arrays BLOB, checksum TEXT)",
 }
 EVERY = 5.0
-"""Least time between two entries, which a stop loses at most besides the frame in progress [s]."""
+"""Least time between two entries [s]; a stop loses at most this and the frame in progress."""
 
 
 class ResumeError(UserError):
@@ -130,7 +130,7 @@ class Resume:
             raise ResumeError(
                 f"{earlier if earlier.exists() else self.file} keeps frames of another scenario, "
                 "option or version, or is damaged; give another folder with --out, or --restart "
-                "to let go of them"
+                "to discard them"
             )
 
     def entries(self) -> Iterator[Any]:
@@ -188,8 +188,8 @@ class Resume:
                 )
         except sqlite3.Error as problem:
             self._every *= 2
-            said = f"{self.file}: the frames since the last entry are not kept ({problem})"
-            warnings.warn(ScenarioWarning(said), stacklevel=2)
+            message = f"{self.file}: the frames since the last entry are not kept ({problem})"
+            warnings.warn(ScenarioWarning(message), stacklevel=2)
             return False
         finally:
             self._last = time.monotonic()

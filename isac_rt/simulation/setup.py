@@ -61,7 +61,7 @@ from isac_rt.world.city.materials import believed_materials
 from isac_rt.world.swarm import Pose, Swarm
 
 BY_BEAM = 10.0
-"""Extra sensitivity assumed for beamforming receivers, linear (10 to 16 dB with 45 channels)."""
+"""Sensitivity gained by coherent integration over channels, a power ratio: 10 to 16 dB with 45."""
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,8 @@ class Frame:
         frame, link = self._at(link)
         all_of, sent = frame._setup.front_ends, frame.sent
         senders = dict.fromkeys([link.tx, *sent])
-        each = [all_of[name] for name in senders for _ in sent[name].streams()]
-        return extension("front_ends")(all_of[link.rx], tuple(each))
+        front_ends = [all_of[name] for name in senders for _ in sent[name].streams()]
+        return extension("front_ends")(all_of[link.rx], tuple(front_ends))
 
     def oscillator_noise_left_out(self, link: tuple[str, str]) -> float:
         """Return the oscillator noise within a chirp that `samples` omit, over the thermal
@@ -169,7 +169,7 @@ class Frame:
 
     def _arriving(self, link: Link) -> list[tuple[Transmission, PathSet]]:
         """Return the signals at a link's receiver, those of its transmitter first; antennas that
-        send at once are separate."""
+        send at once are separate signals."""
         if link not in self.paths:
             received = ", ".join(map(str, self.paths))
             raise ValueError(f"{link} is not received in frame {self.number}; there are {received}")
@@ -181,7 +181,7 @@ class Frame:
             if s.moving_centres is not None:
                 paths = s.moving_centres.with_centres(paths, self.poses, when)
             sent = replace(self.sent[name], clock_offset=clock.offset, clock_drift=clock.drift)
-            out += [(one, paths) for one in sent.streams()]
+            out += [(stream, paths) for stream in sent.streams()]
         return out
 
     def _listening(self, link: Link) -> tuple[ReceiveArray, Reference]:
@@ -224,29 +224,29 @@ class Setup:
     connections: Connections
     plan: Plan
     expectation: ClutterExpectation | None
-    """What an active terminal's receiver predicts of its clutter from the mesh; None where its
-    detector needs none."""
+    """Clutter that an active terminal's receiver expects from the mesh; None if its detector uses
+    none."""
     seconds: Seconds = NONE
-    """What `prepare` took."""
+    """Time that `prepare` took."""
     by_chirp: tuple[Setup, ...] = ()
-    """The set-ups of the radars of each chirp, where not all share one; what is said above of the
-    chirp, the paths and the plan is then that of the first."""
+    """Set-ups of the radars of each chirp if they do not share one; chirp, paths and plan above are
+    then those of the first."""
 
     @property
     def each(self) -> tuple[Setup, ...]:
-        """The set-ups of all chirps; this one where all terminals share one."""
+        """Set-ups of all chirps; this one if all terminals share a chirp."""
         return self.by_chirp or (self,)
 
     def of(self, name: str) -> Setup:
         """Return the set-up of a terminal's chirp."""
-        return next((one for one in self.by_chirp if name in one.plan.timetable.blocks), self)
+        return next((part for part in self.by_chirp if name in part.plan.timetable.blocks), self)
 
     def with_antennas(self, antennas: Antennas) -> Setup:
         """Return the set-up with other antennas at every terminal and newly traced paths.
 
         Raises
         ------
-        ValueError  If they are not of the waveform's transmit antennas.
+        ValueError  If their number of transmit antennas is not that of the waveform.
         """
         if self.by_chirp:
             raise ValueError("terminals have chirps of their own; state swarm.NAME.array")
@@ -275,7 +275,7 @@ class Setup:
 
     @property
     def antennas(self) -> Antennas:
-        """Antennas of the terminals that state none of their own; `arrays.at(link)` are those of a
+        """Antennas of terminals without an array of their own; `arrays.at(link)` are those of a
         link."""
         return self.arrays.common
 
@@ -315,15 +315,16 @@ class Setup:
 
         Raises
         ------
-        isac_rt.extensions.hardware.types.CaptureError  If the file is none, or of another board.
+        isac_rt.extensions.hardware.types.CaptureError  If the file is no calibration, or that of a
+        board of another size.
         """
         file = self.scenario.calibration_path()
         if file is None:
             return None
-        found = extension("calibration")(file)
+        calibration = extension("calibration")(file)
         for antennas in self.arrays:
-            found.check_size(antennas.num_rx, antennas.num_tx)
-        return found
+            calibration.check_size(antennas.num_rx, antennas.num_tx)
+        return calibration
 
     def calibrated(self, cube: IFCube) -> IFCube:
         """Return samples with the calibration of the board applied."""
@@ -392,21 +393,21 @@ class Setup:
         return self.frame_of(number, poses, *traced)
 
     def frame_of(
-        self, number: int, poses: dict[str, Pose], found: Mapping[Link, PathSet], dropped: int = 0
+        self, number: int, poses: dict[str, Pose], traced: Mapping[Link, PathSet], dropped: int = 0
     ) -> Frame:
         """Build the frame from the paths of `find`."""
-        kept = {
+        planned = {
             link: self.plan.apply(paths, self.noise_power(poses, link))
-            for link, paths in found.items()
+            for link, paths in traced.items()
         }
         active = self.timetable.with_role("active", number)
         return Frame(
             number,
             poses,
-            {link: paths for link, (paths, _) in kept.items()},
+            {link: paths for link, (paths, _) in planned.items()},
             {name: self.transmission(name, number, poses[name]) for name in active},
             self._expected_clutter(number),
-            {link: use for link, (_, use) in kept.items()},
+            {link: use for link, (_, use) in planned.items()},
             dropped,
             self,
         )
@@ -508,7 +509,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
 
     Raises
     ------
-    ScenarioError  If the run cannot be: two UAVs meet, it does not fit into memory.
+    ScenarioError  If the run is impossible: two UAVs meet, or memory is too small.
 
     Examples
     --------
@@ -520,7 +521,7 @@ def prepare(scenario: Scenario, store: PathStore | None = None, digest: str | No
     begin = Seconds.of_process()
     digest = city_digest(scenario.city, scenario.folder) if digest is None else digest
     alone = [(one, planned(one)) for one in scenario.by_chirp()]
-    # the blocks, and with them the reach, are found out in the run where links are established
+    # with `access.establish` the blocks, and so the reach, are known after the access stages only
     reach = max(plan.mesh_radius(plan.swarm.middle) for _, plan in alone)
     parts = [_prepared(one, plan, reach, store, digest) for one, plan in alone]
     setup = parts[0] if parts[0].scenario is scenario else _joint(scenario, parts)
@@ -611,7 +612,7 @@ def _prepared(
         plan,
         _expectation_of(scenario, plan, free, believed),
     )
-    _ = setup.calibration  # a file that is none is refused here
+    _ = setup.calibration  # refuses a wrong file here
     return _connected(setup)
 
 
@@ -642,21 +643,23 @@ def _expectation_of(
     if not scenario.needs_mesh:
         return None
     about = scenario.clutter, plan.swarm, believed, plan.waveform
-    own = [link for link in plan.timetable.all_links if link.own]
-    floor = _floor_of(scenario, plan, free, own)
+    monostatic = [link for link in plan.timetable.all_links if link.own]
+    floor = _floor_of(scenario, plan, free, monostatic)
     make = extension("expected_clutter")
     level = scenario.belief.level_db
-    found: ClutterExpectation = make(*about, plan.arrays, scenario.seed, floor, level)
-    return found
+    expectation: ClutterExpectation = make(*about, plan.arrays, scenario.seed, floor, level)
+    return expectation
 
 
 def _believed_city(scenario: Scenario, city: CityMesh) -> CityMesh:
     belief = scenario.belief
     rng = generator(scenario.seed, "mesh error")
-    found = city.without(belief.missing_m).displaced(belief.mesh_m, rng)
+    believed = city.without(belief.missing_m).displaced(belief.mesh_m, rng)
     if belief.materials:
-        found = replace(found, materials=believed_materials(found.materials, belief.materials))
-    return found
+        believed = replace(
+            believed, materials=believed_materials(believed.materials, belief.materials)
+        )
+    return believed
 
 
 def _noise_power(
@@ -674,8 +677,8 @@ def _noise_power(
 
 
 def noise_floor(scenario: Scenario, plan: Plan, reference: FreeSpace) -> NoiseFloor | None:
-    """Return the noise floor of each link for merging scatterers; None without merging: with links
-    established in the run, with mirrors, which bring clutter to other cells, and by the preset
+    """Return the noise floor of each link for merging scatterers. None, without merging: for links
+    established in the run, for mirrors, which move clutter to other cells, and for the preset
     everything."""
     clutter, timetable = scenario.clutter, plan.timetable
     wanted = clutter.model == "field" and scenario.propagation.model == "ray_traced"
@@ -691,7 +694,10 @@ def _floor_of(
     timetable, frames = plan.timetable, plan.spread_frames()
     times = np.array([timetable.epoch(frame) for frame in frames])
     poses = [plan.swarm.poses(time) for time in times]
-    sets = [scenario.receivers, *(one.receivers for one in scenario.compare.values())]
+    sets = [
+        scenario.receivers,
+        *(receiver_set.receivers for receiver_set in scenario.compare.values()),
+    ]
     over_noise = {}
     for link in links:
         by_beam = any(receivers.looks_by_beam(link.own) for receivers in sets)
@@ -725,8 +731,8 @@ def timetable_of(scenario: Scenario, waveform: Waveform, schedule: Schedule) -> 
 
 def arrays_of(scenario: Scenario, waveform: Waveform) -> Arrays:
     """Build the antennas of a scenario's terminals."""
-    own = {n: antennas_of(u.array, waveform) for n, u in scenario.swarm.items() if u.array}
-    return Arrays(antennas_of(scenario.array, waveform), own)
+    by_name = {n: antennas_of(u.array, waveform) for n, u in scenario.swarm.items() if u.array}
+    return Arrays(antennas_of(scenario.array, waveform), by_name)
 
 
 def plan_of(scenario: Scenario, arrays: Arrays, timetable: Timetable, swarm: Swarm) -> Plan:
@@ -754,10 +760,10 @@ def _connected(setup: Setup) -> Setup:
         return replace(setup, connections=Connections(clocks))
 
     outcome = extension("access")(setup, clocks)
-    found = Connections(clocks, outcome)
-    timetable = replace(setup.timetable, blocks=outcome.blocks, refused=found.refused)
+    connections = Connections(clocks, outcome)
+    timetable = replace(setup.timetable, blocks=outcome.blocks, refused=connections.refused)
     plan = replace(setup.plan, timetable=timetable)
-    return replace(setup, timetable=timetable, connections=found, plan=plan)
+    return replace(setup, timetable=timetable, connections=connections, plan=plan)
 
 
 def swarm_of(scenario: Scenario) -> Swarm:

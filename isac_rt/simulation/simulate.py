@@ -1,4 +1,5 @@
-"""run(scenario) -> Results: the one place where the stages meet. No physics here."""
+"""Run of a scenario: the loop over frames that joins propagation, synthesis, receivers, tracking
+and scores."""
 
 from __future__ import annotations
 
@@ -60,23 +61,21 @@ def run(
     Parameters
     ----------
     scenario : Scenario
-    progress : called with the frames done and the frames in all; True: a bar on a terminal or in a
+    progress : function of the frames done and all frames; True: a bar on a terminal or in a
         notebook; False or None: nothing
-    setup : from `prepare`, if it is there already
-    threads : receivers at work at once; None: one more than the machine has cores
-    snapshots : frames, spread over those that the active terminals process, of which maps and path
-        ledger are kept
-    terminal : makes the receiver of a link: any object with `receive`, which is given what
-        `ActiveTerminal.receive` or `PassiveTerminal.receive` is, or a terminal, whose tracking may
-        be another too
-    resume : where the frames are kept meanwhile and from where a run that was stopped goes on
-    keep : ["samples"] keeps the cubes of samples in `Results.samples`; a function is called with
-        every frame, link and cube that a receiver is given, in the receivers' threads. Frames that
-        `resume` has already are left out
+    setup : result of `prepare`; None: prepare here
+    threads : receivers that work at once; None: one more than the machine has cores
+    snapshots : number of frames whose maps and paths are stored, spread over the frames that the
+        active terminals process
+    terminal : factory of the receiver of a link: an object with `receive`, called like
+        `ActiveTerminal.receive` or `PassiveTerminal.receive`, or a terminal with other tracking too
+    resume : file in which finished frames are saved, and from which a stopped run resumes
+    keep : ["samples"] stores the cubes of samples in `Results.samples`; a function is called with
+        every frame, link and cube, in the receivers' threads. Frames from `resume` are left out
 
     Returns
     -------
-    Results; the same for one scenario and set of versions whatever the number of threads
+    Results; the same for one scenario and set of versions, for any number of threads
 
     Examples
     --------
@@ -105,7 +104,7 @@ def run(
 
 
 def _attributes(setup: Setup, summary: Mapping[str, Any]) -> dict[str, str]:
-    """Attributes of a run's dataset, as JSON."""
+    """Return the attributes of a run's dataset, as JSON."""
     out = {
         "fidelity": summary["fidelity"],
         "city": summary["city"],
@@ -122,15 +121,15 @@ def _attributes(setup: Setup, summary: Mapping[str, Any]) -> dict[str, str]:
 def summarise(
     scenario: Scenario, *, setup: Setup | None = None, threads: int | None = None
 ) -> dict[str, Any]:
-    """The summary of a run (`summary.json`) without its dataset; parameters as for `run`."""
+    """Return the summary of a run (`summary.json`) without its dataset; parameters as for `run`."""
     run = _Run.begin(scenario, setup, 0, standard_terminal)
     run.fly(None, threads, None)
     return run.summary()
 
 
 class _AtWork(NamedTuple):
-    """Frame whose receivers are at work, and if it is to be kept what each station carries over
-    right after it; a station that is missing there carries what it holds once all are done."""
+    """Frame whose receivers are at work, and, if it is to be saved, the state of each station after
+    it. A station that is not in `carried` is read when all have finished."""
 
     frame: Frame
     jobs: Jobs
@@ -139,15 +138,15 @@ class _AtWork(NamedTuple):
 
 @dataclass
 class _Run:
-    """Frames of a run so far, recorded and scored.
+    """Run in progress: receivers and records of the frames so far.
 
     Attributes
     ----------
-    sets : receivers by name: the scenario's own first, the only ones on which anything that is sent
-        depends, then those compared with them
-    schedules : of the active terminals, by the receivers' advice
-    snapshots : frames of which maps and path ledger are kept
-    kept : frames that a later call could go on after
+    sets : sets of receivers by name: the scenario's first, whose feedback alone affects what is
+        sent, then those of `compare`
+    schedules : antenna schedules of the active terminals, by the receivers' feedback
+    snapshots : numbers of the frames whose maps and paths are stored
+    kept : number of frames saved for a later call
     """
 
     setup: Setup
@@ -166,28 +165,28 @@ class _Run:
         snapshots: int,
         terminal: Callable[[Setup, Link], Terminal | Receiver],
     ) -> _Run:
-        """Before the first frame."""
+        """Build the run before its first frame."""
         s, stopwatch = setup or prepare(scenario), Stopwatch()
         stopwatch.set_up(s.seconds)
 
-        def own(link: Link) -> Terminal:
+        def make(link: Link) -> Terminal:
             return terminal_with(s.of(link.tx), link, terminal(s.of(link.tx), link))
 
-        sets = {OWN: StationSet.of(s, own, scenario.receivers)}
-        for name, one in scenario.compare.items():
-            standard = partial(standard_terminal, s, settings=one)
-            sets[name] = StationSet.of(s, standard, one.receivers)
+        sets = {OWN: StationSet.of(s, make, scenario.receivers)}
+        for name, receiver_set in scenario.compare.items():
+            standard = partial(standard_terminal, s, settings=receiver_set)
+            sets[name] = StationSet.of(s, standard, receiver_set.receivers)
         schedules = Schedules(s.schedule, s.antennas.num_tx, scenario.array.fall_back)
         return cls(s, sets, schedules, s.timetable.snapshots(snapshots), stopwatch)
 
     @property
     def own(self) -> StationSet:
-        """The scenario's own receivers."""
+        """Receivers of the scenario."""
         return self.sets[OWN]
 
     @property
     def recorder(self) -> Recorder:
-        """Recorder of the scenario's own receivers."""
+        """Recorder of the scenario's receivers."""
         return self.own.recorder
 
     def fly(self, progress: Progress | None, threads: int | None, resume: Resume | None) -> None:
@@ -206,10 +205,10 @@ class _Run:
                     progress(len(self.recorder), self.setup.timetable.frames)
 
     def in_order(self, pool: ThreadPoolExecutor, resume: Resume | None) -> Iterator[_AtWork]:
-        """Yield the frames in their order; while one is at work the next is traced.
+        """Yield the frames in order; the next one is traced while the receivers of one work.
 
-        A link's jobs are done one after the other. Where what is sent depends on what was
-        received, a frame waits for all receivers of the one before.
+        The jobs of a link run one after the other. With feedback or fall-back, where a transmission
+        depends on earlier receptions, a frame waits for all receivers of the frame before.
         """
         setup, frames = self.setup, self.setup.timetable.frames
         dependent = setup.scenario.access.feedback or setup.scenario.array.fall_back
@@ -217,17 +216,20 @@ class _Run:
         at_work: deque[_AtWork] = deque()
         last: dict[Link, Future[Any]] = {}
         for number in range(self.restore(resume) if resume else 0, frames):
+            # trace, and wait for the oldest frame if enough are at work
             with self.stopwatch.stage("trace"):
                 frame = setup.frame(number)
             while len(at_work) >= at_once:
                 yield at_work.popleft()
             if setup.scenario.array.fall_back:
                 frame = frame.sent_by({name: self.schedules.of(name) for name in frame.sent})
+            # one job per link, after the previous one of the same link
             jobs = {}
             for link in setup.timetable.links(number):
-                reports = [one.reports(link, number) for one in self.sets.values()]
+                reports = [receivers.reports(link, number) for receivers in self.sets.values()]
                 jobs[link] = pool.submit(self.receive, frame, link, reports, last.get(link))
             last |= jobs
+            # states to be saved, read right after these jobs
             carried: Carried | None = None
             if resume and resume.due() and number + 1 < frames:
                 links = [] if dependent else setup.timetable.all_links
@@ -243,12 +245,9 @@ class _Run:
         reports: Sequence[Sequence[ReportedUav]],
         before: Future[Any] | None,
     ) -> list[LinkResult]:
-        """Process a frame with a link's receivers, those of the scenario first; all get the same
-        samples, and each its own reports.
-
-        What was `before` at this link is a job that the pool began earlier, so that waiting for it
-        ends.
-        """
+        """Process a frame with a link's receivers, the scenario's first: all get the same samples,
+        each its own reports. `before` is the link's previous job, begun earlier, so waiting for it
+        cannot block the pool."""
         with self.stopwatch.stage("synthesis"):
             cube = frame.received(link).shared()
         if self.observe is not None:
@@ -258,38 +257,41 @@ class _Run:
         with self.stopwatch.stage("receive"):
             maps = frame.number in self.snapshots
             return [
-                one.stations[link].receive(frame, cube, maps and one is self.own, known)
-                for one, known in zip(self.sets.values(), reports, strict=True)
+                receivers.stations[link].receive(
+                    frame, cube, maps and receivers is self.own, own_reports
+                )
+                for receivers, own_reports in zip(self.sets.values(), reports, strict=True)
             ]
 
     def carried(self, link: Link, before: Future[Any] | None) -> list[dict[str, Any]]:
-        """Return what the terminals of a link, those of the scenario first, carry over from their
-        jobs `before` this one, which the pool began earlier."""
+        """Return the states of a link's terminals, the scenario's first, after the job `before`."""
         if before is not None:
             before.result()
-        return deepcopy([one.stations[link].terminal.memory() for one in self.sets.values()])
+        return deepcopy(
+            [receivers.stations[link].terminal.memory() for receivers in self.sets.values()]
+        )
 
     def keep(self, resume: Resume, carried: Carried) -> None:
-        """Keep the frames collected so far, for a later call of the same run."""
+        """Save the frames collected so far for a later call of the same run."""
         by_set = [
             {link: job.result()[i] for link, job in carried.items()} for i in range(len(self.sets))
         ]
         if resume.append(self.memory(by_set)):
             self.kept = len(self.recorder)
-            for one in self.sets.values():
-                one.recorder.amended.clear()
+            for receivers in self.sets.values():
+                receivers.recorder.amended.clear()
 
     def collect(self, frame: Frame, jobs: Jobs) -> None:
-        """Wait for a frame's receivers, score and record it, take the own receivers' advice."""
+        """Wait for a frame's receivers, score and record it, and take their feedback."""
         results = {link: job.result() for link, job in jobs.items()}
         received = {link: by_set[0] for link, by_set in results.items()}
         with self.stopwatch.stage("track"):
             if self.setup.scenario.access.feedback:
                 self._feed_back(frame.number, received)
             snapshot = frame.number in self.snapshots
-            for i, one in enumerate(self.sets.values()):
+            for i, receivers in enumerate(self.sets.values()):
                 of_set = {link: by_set[i] for link, by_set in results.items()}
-                one.record(frame, of_set, snapshot and i == 0)
+                receivers.record(frame, of_set, snapshot and i == 0)
             self.schedules.take_advice({link: h.reception for link, h in received.items()})
 
     def _feed_back(self, frame: int, received: Mapping[Link, LinkResult]) -> None:
@@ -300,49 +302,48 @@ class _Run:
                 self.own.stations[link].feed_back(frame, received[link], at_active)
 
     def memory(self, carried: Sequence[Mapping[Link, dict[str, Any]]]) -> dict[str, Any]:
-        """Return what a later call needs to go on after the frames so far: those since the last
-        entry, and all that receivers carry over, of each set of them that which is `carried`
-        already.
+        """Return the state from which a later call resumes: the frames since the last entry, and
+        the states of each set of receivers, `carried` where they were read earlier.
 
-        Paths and samples are functions of the frame alone and are made anew.
+        Paths and samples are functions of the frame alone and are not saved.
         """
         sets = zip(self.sets.items(), carried, strict=True)
         return {
             "first": self.kept,
-            "sets": {name: one.memory(self.kept, by_link) for (name, one), by_link in sets},
+            "sets": {name: r.memory(self.kept, by_link) for (name, r), by_link in sets},
             "advice": plain(self.schedules.advice),
             "seconds": self.stopwatch.so_far(),
         }
 
     def restore(self, resume: Resume) -> int:
-        """Take up what an earlier call of the same run kept; the number of the next frame."""
+        """Restore the state saved by an earlier call of the same run; return the next frame."""
         last = None
         for entry in resume.entries():
             with resume.reading():
                 if entry["first"] == len(self.recorder):  # not another call's at the same time
-                    for name, one in self.sets.items():
+                    for name, receivers in self.sets.items():
                         part = entry["sets"][name]
-                        one.recorder.restore(part["rows"], part["amended"])
+                        receivers.recorder.restore(part["rows"], part["amended"])
                     last = entry
         if last is not None:
             with resume.reading():
-                for name, one in self.sets.items():
-                    one.restore(last["sets"][name])
+                for name, receivers in self.sets.items():
+                    receivers.restore(last["sets"][name])
                 self.schedules.advice = restored(dict[Link, bool], last["advice"])
                 self.stopwatch.restore(last["seconds"])
         self.kept = len(self.recorder)
         return self.kept
 
     def summary(self) -> dict[str, Any]:
-        """`summary.json` of the frames so far."""
+        """Return `summary.json` of the frames so far."""
         s = self.setup
-        compared = {name: one for name, one in self.sets.items() if name != OWN}
+        compared = {name: receivers for name, receivers in self.sets.items() if name != OWN}
         figures = Figures(
             timing=self.stopwatch.so_far(),
             plan=s.fidelity(),
             access=self._access(),
-            compared={name: one.blocks() for name, one in compared.items()},
-            costs={name: one.costs() for name, one in self.sets.items()} if compared else {},
+            compared={name: receivers.blocks() for name, receivers in compared.items()},
+            costs={name: r.costs() for name, r in self.sets.items()} if compared else {},
         )
         named = {"scenario": s.scenario.name, "seed": s.scenario.seed, "city": s.city.record()}
         return named | self.recorder.summary(figures)

@@ -24,8 +24,8 @@ from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal, Receiver
 from isac_rt.world.swarm import Pose, Swarm
 
 PREFETCHED_FRAMES = 2
-"""Frames at work at once: a frame does not wait for the slowest link of the one before, and its
-receivers know what was reported to them until this many frames before it."""
+"""Frames that are processed at once, so that none waits for the slowest link of the one before;
+reports reach a receiver this many frames late."""
 Terminal = ActiveTerminal | PassiveTerminal
 
 
@@ -42,11 +42,11 @@ def standard_terminal(setup: Setup, link: Link, settings: ReceiverSet | None = N
     setup = setup.of(link.tx)
     s = settings or setup.scenario
     equipment = extension("equipment")(setup, link, s)
-    known = setup.waveform, setup.arrays.at(link), s.receivers, s.tracking
+    settings_of = setup.waveform, setup.arrays.at(link), s.receivers, s.tracking
     if link.own:
-        return ActiveTerminal(*known, equipment)
+        return ActiveTerminal(*settings_of, equipment)
     order, groups = setup.scenario.modulation.dpsk_order, setup.timetable.groups(link)
-    return PassiveTerminal(*known, order, setup.plan.amplitudes[link.tx], groups, equipment)
+    return PassiveTerminal(*settings_of, order, setup.plan.amplitudes[link.tx], groups, equipment)
 
 
 def terminal_with(setup: Setup, link: Link, made: Terminal | Receiver) -> Terminal:
@@ -86,21 +86,21 @@ class Station:
         maps: bool,
         reports: Sequence[ReportedUav] = (),
     ) -> LinkResult:
-        """Receive one frame and track; `reports` are targets reported by others. Runs in a thread
-        of its own and changes this station's state only."""
+        """Receive one frame and track, with targets reported by other terminals. Runs in a worker
+        thread and changes the state of this station only."""
         begun = time.thread_time()
         timetable, (tx, rx) = self.setup.timetable, self.link
         when = timetable.epoch(frame.number, tx)
-        own = self.setup.believed(rx, self.setup.swarm.trajectories[rx].pose(when))
+        pose = self.setup.believed(rx, self.setup.swarm.trajectories[rx].pose(when))
         reported_poses = self._reported_poses(frame.number, when)
         state = int(TerminalState.TRACKING)
-        late: tuple[Late, ...] = ()
+        late_frames: tuple[Late, ...] = ()
         if isinstance(self.terminal, ActiveTerminal):
             payload, clutter = frame.sent[tx].payload, frame.expected.get(tx)
             reception, tracks = self.terminal.step(
                 cube,
                 payload,
-                own,
+                pose,
                 when,
                 clutter=clutter,
                 reported_poses=reported_poses,
@@ -111,7 +111,7 @@ class Station:
             modulated = timetable.modulated(frame.number)
             reception, tracks = self.terminal.step(
                 cube,
-                own,
+                pose,
                 when,
                 modulated,
                 reported_poses=reported_poses,
@@ -119,9 +119,9 @@ class Station:
                 reports=reports,
                 maps=maps,
             )
-            state, late = int(self.terminal.status), self.terminal.late
+            state, late_frames = int(self.terminal.status), self.terminal.late
         self.seconds += time.thread_time() - begun
-        return LinkResult(reception, tracks, state, late)
+        return LinkResult(reception, tracks, state, late_frames)
 
     def _sender(self, when: float) -> Pose | None:
         """Return the reported pose of the link's transmitter; None without a report."""
@@ -131,8 +131,8 @@ class Station:
         return s.believed(self.link.tx, s.swarm.trajectories[self.link.tx].pose(when))
 
     def _reported_poses(self, frame: int, when: float) -> list[Pose]:
-        """Return the reported poses that the receiver uses: of the other end of the link, or at an
-        active terminal of all links."""
+        """Return the reported poses that self-calibration uses: that of the transmitter, or at an
+        active terminal those of all passive ones."""
         s = self.setup
         if self.receivers.self_calibration != "positions":
             return []
@@ -141,8 +141,7 @@ class Station:
         return [s.believed(n, s.swarm.trajectories[n].pose(when)) for n in names if n != rx]
 
     def feed_back(self, frame: int, received: LinkResult, at_active: LinkResult) -> None:
-        """Exchange the feedback of the passive terminal after a frame, and the answer of the active
-        one."""
+        """Exchange a passive terminal's feedback after a frame and the active one's answer."""
         if not isinstance(self.terminal, PassiveTerminal):
             return
         s, when = self.setup, self.setup.timetable.epoch(frame, self.link.tx)
@@ -171,7 +170,7 @@ class Station:
         }
 
     def restore(self, memory: dict[str, Any]) -> None:
-        """Go on from a `memory`."""
+        """Restore a state of `memory`."""
         self.terminal.restore(memory["terminal"])
         self.scorer.restore(memory["scorer"])
         self.feedback, self.seconds = memory["feedback"], memory["seconds"]
@@ -236,8 +235,7 @@ class StationSet:
         )
 
     def reports(self, link: Link, frame: int) -> list[ReportedUav]:
-        """Return the reports for a link's receiver in a frame: those of `PREFETCHED_FRAMES` frames
-        before, so that no frame waits for the previous one."""
+        """Return the reports for a link's receiver in a frame, of `PREFETCHED_FRAMES` before."""
         when = self.recorder.timetable.epoch(frame, link.tx)
         return self.exchange.reports(link, frame - PREFETCHED_FRAMES, when) if self.exchange else []
 
@@ -245,11 +243,13 @@ class StationSet:
         """Compare a frame with the truth, and exchange reports after it."""
         timetable, number = self.recorder.timetable, frame.number
         records = {link: self.stations[link].record(frame, h) for link, h in received.items()}
-        late = {link: self.stations[link].scorer.late(number, h) for link, h in received.items()}
+        late_records = {
+            link: self.stations[link].scorer.late(number, h) for link, h in received.items()
+        }
         fused_records: dict[str, FusedRecord] = {}
         if self.exchange is not None:
             symbols = {link: o.symbols for link, o in records.items()}
-            views = self.exchange.step(number, received, symbols, late)
+            views = self.exchange.step(number, received, symbols, late_records)
             poses = {name: self.swarm.poses(view.time) for name, view in views.items()}
             fused_records = self.fused.record(number, views, records, poses)
         self.recorder.add(
@@ -265,9 +265,9 @@ class StationSet:
                 fused_records=fused_records,
             )
         )
-        for link, frames in late.items():
-            for one in frames:
-                self.recorder.amend(link, one)
+        for link, frames in late_records.items():
+            for late_record in frames:
+                self.recorder.amend(link, late_record)
 
     def blocks(self) -> dict[str, Any]:
         """Return `terminals`, `links` and `swarm` of the summary."""

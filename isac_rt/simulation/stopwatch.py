@@ -24,11 +24,11 @@ class Seconds(NamedTuple):
     processor: float = 0.0
     wall: float = 0.0
 
-    def __add__(self, other: Any) -> Seconds:
-        return Seconds(self[0] + other[0], self[1] + other[1])
+    def __add__(self, more: Any) -> Seconds:
+        return Seconds(self[0] + more[0], self[1] + more[1])
 
-    def __sub__(self, other: Any) -> Seconds:
-        return Seconds(self[0] - other[0], self[1] - other[1])
+    def __sub__(self, earlier: Any) -> Seconds:
+        return Seconds(self[0] - earlier[0], self[1] - earlier[1])
 
     @classmethod
     def of_process(cls) -> Seconds:
@@ -77,12 +77,12 @@ class Stopwatch:
         """Return processor seconds of each stage, ``other`` and ``total``; under ``wall`` the wall
         seconds, without ``other``."""
         total = self.before + (Seconds.of_process() - self.begun)
-        processor = {name: one.processor for name, one in self.spent.items()}
+        processor = {name: spent.processor for name, spent in self.spent.items()}
         return {
             **processor,
             "other": max(total.processor - sum(processor.values()), 0.0),
             "total": total.processor,
-            "wall": {**{name: one.wall for name, one in self.spent.items()}, "total": total.wall},
+            "wall": {**{name: s.wall for name, s in self.spent.items()}, "total": total.wall},
         }
 
     def restore(self, earlier: Mapping[str, Any]) -> None:

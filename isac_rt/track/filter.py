@@ -1,5 +1,5 @@
-"""The extended Kalman filter of one UAV: measurement model of both terminals, prediction, update
-and initiation."""
+"""Extended Kalman filter of one UAV: measurement models of both kinds of terminals, prediction,
+update and initiation."""
 
 from __future__ import annotations
 
@@ -16,26 +16,24 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.world.swarm import Pose
 
 STD_FLOOR = np.array([1e-3, 1e-2, 2e-4, 2e-4])
-"""Smallest measurement standard deviations that are believed [m, m/s, 1, 1]. At high SNR the errors
-are not noise but the interpolation between cells, alike in successive frames: about 0.002 cell in
-range, 0.02 in velocity, 0.002 in angle."""
+"""Smallest measurement standard deviations [m, m/s, 1, 1]. At high SNR interpolation between cells
+dominates and is alike in successive frames: about 0.002 cell in range, 0.02 in velocity, 0.002 in
+angle."""
 INITIAL_SPEED_STD = 10.0
-"""Per axis [m/s]: before its first detection a UAV is taken to stand still in the world, give or
-take this."""
+"""Standard deviation of a UAV's velocity per axis before its first detection, about zero [m/s]."""
 INITIAL_SPEED_DEVIATIONS = 3.0
-"""A folded velocity is also read as its second nearest to standing still, up to this many of those
-deviations."""
+"""Largest speed of the second reading of an ambiguous velocity [`INITIAL_SPEED_STD`]."""
 INITIAL_POSITION_STD_LIMIT = 100.0
-"""A single detection that fixes the position worse than this [m] starts no track (near the line
-through both terminals a bistatic length says nothing about where the reflector is)."""
+"""Largest standard deviation of the position from one detection that starts a track [m]. Near the
+line through both terminals a bistatic path length does not fix the position."""
 MANOEUVRE_TIME = 1.0
-"""Correlation time of a UAV's acceleration [s]. Turns, braking and gusts hold theirs for half a
-second to some seconds; with PX4's default limits of 3 m/s^2 and 4 m/s^3 one needs 0.75 s."""
+"""Correlation time of a UAV's acceleration [s]. Turns, braking and gusts last half a second to some
+seconds; with PX4's default limits of 3 m/s^2 and 4 m/s^3 one needs 0.75 s."""
 _ITERATIONS = 10
 ROUNDING = 1e-12
-"""Of states of no deviation."""
+"""Change of a state without deviation at which the iteration has converged."""
 POSITION = np.array([0, 2, 3])
-"""Rows of a measurement that fix a place: range, u_x, u_z."""
+"""Rows of a measurement that fix the position: range, u_x, u_z."""
 
 
 class Gaussian(NamedTuple):
@@ -47,16 +45,16 @@ class Gaussian(NamedTuple):
 
 
 class Ambiguity(NamedTuple):
-    """Ambiguity of a detection: the Doppler does not distinguish velocities a `period` [m/s] apart.
-    The beat depends on range and Doppler, so a detection whose velocity was read one period too
-    high was read too short by `shift` [m]."""
+    """Ambiguity of a detection: velocities a `period` [m/s] apart have the same Doppler bin. The
+    beat depends on range and Doppler, so a velocity read one period too high goes with a range read
+    too short by `shift` [m]."""
 
     period: float = np.inf
     shift: float = 0.0
 
     @classmethod
     def of(cls, waveform: Waveform, passes: int) -> Ambiguity:
-        """At an active terminal (2 passes) or a passive one (1)."""
+        """Return the ambiguity at an active terminal (2 passes) or a passive one (1)."""
         period = 2 * waveform.max_velocity(passes)
         if passes == 2:
             period *= unambiguous_share(waveform)
@@ -67,8 +65,8 @@ UNAMBIGUOUS = Ambiguity()
 
 
 def _unit(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Length and direction of (..., 3); written without abs so that a complex step passes
-    through."""
+    """Return length and direction of vectors (..., 3), without abs: tests differentiate by a
+    complex step."""
     length = np.sqrt(np.sum(vector * vector, axis=-1))
     return length, vector / length[..., None]
 
@@ -77,10 +75,9 @@ def measure(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None)
     r"""Return the measurement by `own` of a target: range, range rate and the direction cosines u_x
     and u_z.
 
-    One-way form (an echo's range at the AT, the line of sight at a PT):
+    One-way form (echoes at the AT, lines of sight at a PT):
     :math:`r = |x-p|,\ \dot r = e\cdot(v-v_p),\ u = R^T e` with :math:`e = (x-p)/r`. Bistatic form:
-    the path length
-    :math:`|x-p_t| + |x-p|` and its rate; the direction is still that of arrival.
+    the path length :math:`|x-p_t| + |x-p|` and its rate, and the direction of arrival.
 
     Parameters
     ----------
@@ -103,9 +100,9 @@ def measure(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None)
 
 
 def _segment_jacobian(offset: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivative of (length, rate) of one path segment with respect to relative position and
-    velocity (..., 2, 6), and of its direction with respect to the position, (I - e e^T)/r (..., 3,
-    3)."""
+    """Return the derivatives (..., 2, 6) of (length, rate) of one path segment with respect to
+    relative position and velocity, and (..., 3, 3) of its direction with respect to the position,
+    (I - e e^T)/r."""
     r, e = _unit(offset)
     turn = (np.eye(3) - e[..., :, None] * e[..., None, :]) / r[..., None, None]
     segment = np.zeros((*e.shape[:-1], 2, 6))
@@ -115,7 +112,7 @@ def _segment_jacobian(offset: np.ndarray, velocity: np.ndarray) -> tuple[np.ndar
 
 
 def jacobian(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None) -> np.ndarray:
-    """Derivative of `measure` with respect to the UAV's states (..., S): (..., 4, S)."""
+    """Return the derivative (..., 4, S) of `measure` with respect to the UAV's states (..., S)."""
     segment, turn = _segment_jacobian(state[..., :3] - own.position, state[..., 3:6] - own.velocity)
     out = np.zeros((*state.shape[:-1], 4, state.shape[-1]))
     out[..., :2, :6] = segment
@@ -126,12 +123,12 @@ def jacobian(state: np.ndarray, own: Pose, transmitter: np.ndarray | None = None
 
 
 def curvature(g: Gaussian, own: Pose, transmitter: np.ndarray | None = None) -> np.ndarray:
-    r"""Return the covariance (..., 4, 4) that the second derivatives of range and range rate add to
-    what is expected of states: :math:`\tfrac12\mathrm{tr}(H_i P H_j P)` (Bar-Shalom, Li and
+    r"""Return the covariance (..., 4, 4) that the second derivatives H of range and range rate add
+    to expected measurements: :math:`\tfrac12\mathrm{tr}(H_i P H_j P)` (Bar-Shalom, Li and
     Kirubarajan, "Estimation with applications to tracking and navigation", 10.3.2).
 
-    A board with three rows knows a height to metres and a range to centimetres: linearised at a
-    wrong height, each range seems to tell the height.
+    An array of three rows fixes a height to metres, a range to centimetres. Linearised at a wrong
+    height, each range would appear to measure the height.
     """
     x, P = g.mean, g.covariance[..., None, :6, :6]
     H = _segment_hessian(x[..., :3] - own.position, x[..., 3:6] - own.velocity)
@@ -143,8 +140,8 @@ def curvature(g: Gaussian, own: Pose, transmitter: np.ndarray | None = None) -> 
 
 
 def _segment_hessian(offset: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Second derivatives of (length, rate) of one path segment with respect to relative position
-    and velocity (..., 2, 6, 6)."""
+    """Return the second derivatives (..., 2, 6, 6) of (length, rate) of one path segment with
+    respect to relative position and velocity."""
     r, e = _unit(offset)
     turn = _segment_jacobian(offset, velocity)[1]
     mixed = e[..., :, None] * (turn @ velocity[..., None])[..., None, :, 0]
@@ -157,8 +154,8 @@ def _segment_hessian(offset: np.ndarray, velocity: np.ndarray) -> np.ndarray:
 
 
 def transmitter_jacobian(state: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
-    """Derivative of the bistatic `measure` of UAVs (..., 6 or 9) with respect to the
-    transmitter's state (S,): (..., 4, S)."""
+    """Return the derivative (..., 4, S) of the bistatic `measure` of UAVs (..., 6 or 9) with
+    respect to the transmitter's state (S,)."""
     out = np.zeros((*state.shape[:-1], 4, transmitter.size))
     offset, speed = state[..., :3] - transmitter[:3], state[..., 3:6] - transmitter[3:6]
     out[..., :2, :6] = -_segment_jacobian(offset, speed)[0]
@@ -168,11 +165,11 @@ def transmitter_jacobian(state: np.ndarray, transmitter: np.ndarray) -> np.ndarr
 def measurement_covariance(
     std: np.ndarray, mean: np.ndarray, transmitter: Gaussian | None = None
 ) -> np.ndarray:
-    """R (..., 4, 4) of detections: their own deviations (..., 4), not below `STD_FLOOR`, and for
-    bistatic ones the uncertainty of the transmitter's track, seen from the targets' states `mean`.
+    """Return R (..., 4, 4) of detections from their deviations (..., 4), at least `STD_FLOOR`;
+    bistatic ones add the uncertainty of the transmitter's track, at the targets' states `mean`.
 
-    The transmitter's error is the same in successive frames, but is treated here as if it were
-    drawn anew: a reflector's covariance is too small by what they share.
+    The transmitter's error persists between frames but is treated as independent: a reflector's
+    covariance is too small by the common part.
     """
     R = np.fmax(std, STD_FLOOR)[..., None] ** 2 * np.eye(4)
     if transmitter is not None:
@@ -183,13 +180,14 @@ def measurement_covariance(
 
 @lru_cache(maxsize=64)
 def singer(interval: float, acceleration_std: float) -> tuple[np.ndarray, np.ndarray]:
-    r"""Transition F (9, 9) and covariance Q (9, 9) of Singer's model over an interval [s].
+    r"""Return transition F (9, 9) and covariance Q (9, 9) of Singer's model [1]_ over an interval
+    [s].
 
     The acceleration of each axis is a stationary Gauss-Markov process of standard deviation
     :math:`\sigma` [m/s^2] and correlation time :math:`\tau` = `MANOEUVRE_TIME`,
-    :math:`\dot a = -a/\tau + w` with the density :math:`2\sigma^2/\tau` of w. As a process in
-    continuous time it does not know how an interval is cut into frames:
-    :math:`Q(2T) = F(T) Q(T) F(T)^T + Q(T)`, by which intervals beyond :math:`\tau` are halved.
+    :math:`\dot a = -a/\tau + w` with the density :math:`2\sigma^2/\tau` of w. F and Q are Van
+    Loan's matrix exponential [2]_. Intervals beyond :math:`\tau` are halved, as
+    :math:`Q(2T) = F(T) Q(T) F(T)^T + Q(T)`.
 
     References
     ----------
@@ -201,7 +199,7 @@ def singer(interval: float, acceleration_std: float) -> tuple[np.ndarray, np.nda
     if interval > MANOEUVRE_TIME:
         F, Q = singer(interval / 2, acceleration_std)
         return F @ F, F @ Q @ F.T + Q
-    A = np.diag([1.0, 1.0], 1)  # of position, T velocity, T^2 acceleration over T: of order one
+    A = np.diag([1.0, 1.0], 1)  # state (position, T velocity, T^2 acceleration), time in units of T
     A[2, 2] = -interval / MANOEUVRE_TIME
     M = np.zeros((6, 6))
     M[:3, :3], M[2, 5], M[3:, 3:] = -A, 1.0, A.T
@@ -213,8 +211,8 @@ def singer(interval: float, acceleration_std: float) -> tuple[np.ndarray, np.nda
 
 
 def predict(g: Gaussian, interval: float, acceleration_std: float) -> Gaussian:
-    """A track after an interval [s] by Singer's model of its acceleration [m/s^2]."""
-    if interval == 0:  # the same time again; the powers of the interval in `singer` have no limit
+    """Return a track after an interval [s] by Singer's model of its acceleration [m/s^2]."""
+    if interval == 0:  # `singer` divides by the interval
         return g
     F, Q = singer(interval, acceleration_std)
     P = F @ g.covariance @ F.T + Q
@@ -230,13 +228,12 @@ def update(
     *,
     ambiguity: Ambiguity = UNAMBIGUOUS,
 ) -> Gaussian:
-    """Condition states (..., S) on a measurement (..., 4) each, with covariances R (..., 4, 4);
-    components that are NaN were not measured, the same ones in all.
+    """Condition states (..., S) on a measurement (..., 4) each, with covariances R (..., 4, 4).
+    Components that are NaN were not measured; they are the same in all.
 
-    Iterated EKF: the measurement is linearised again at the new mean until it stands (Gauss-Newton
-    on the posterior), because a range known to a millimetre across a direction known to a metre
-    bends visibly. Joseph form. Of what the `ambiguity` leaves open the reading nearest in velocity
-    counts.
+    Iterated EKF in Joseph's form: linearisation at the new mean until it converges (Gauss-Newton on
+    the posterior), because a range known to a millimetre over a cross-range known to a metre is
+    visibly nonlinear. Of ambiguous velocities the nearest to the state's counts.
     """
     rows = np.flatnonzero(np.isfinite(measurement).reshape(-1, 4).all(axis=0))
     return _updated(g, measurement, R, rows, own, transmitter, ambiguity)
@@ -251,7 +248,7 @@ def _updated(
     transmitter: np.ndarray | None,
     ambiguity: Ambiguity,
 ) -> Gaussian:
-    """`update` by some `rows` of the measurements."""
+    """Return `update` by the `rows` of the measurements."""
 
     def seen(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         off = wrapped(measurement - measure(x, own, transmitter), ambiguity)
@@ -263,14 +260,15 @@ def _updated(
 def conditioned(
     g: Gaussian, R: np.ndarray, seen: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 ) -> Gaussian:
-    """Condition states (..., S) on measurements (..., n) of covariances R by the iterated EKF, in
-    Joseph's form: `seen` returns the measurements less what is expected at states, and the
-    derivatives (..., n, S) of the latter. Each state stays once it is settled."""
+    """Condition states (..., S) on measurements (..., n) of covariances R by the iterated EKF in
+    Joseph's form. `seen` returns, at states, the measurements less the expected ones and the
+    derivatives H (..., n, S) of the latter. A converged state does not change any more."""
     mean, P = g
     x, moving = mean, np.ones(mean.shape[:-1], bool)
     enough = 1e-3 * np.sqrt(np.diagonal(P, axis1=-2, axis2=-1)) + ROUNDING
     K, H = np.zeros((*mean.shape, R.shape[-1])), np.zeros((*R.shape[:-1], mean.shape[-1]))
     for _ in range(_ITERATIONS):
+        # K = P H^T S^-1, S = H P H^T + R; x = mean + K (z - h(x) - H (mean - x))
         off, at_x = seen(x)
         H = np.where(moving[..., None, None], at_x, H)
         gain = np.linalg.solve(H @ P @ np.swapaxes(H, -1, -2) + R, H @ P)  # S^-1 H P
@@ -281,6 +279,7 @@ def conditioned(
         x = new
         if not moving.any():
             break
+    # Joseph: (I - K H) P (I - K H)^T + K R K^T
     A = np.eye(x.shape[-1]) - K @ H
     P = A @ P @ np.swapaxes(A, -1, -2) + K @ R @ np.swapaxes(K, -1, -2)
     return Gaussian(x, (P + np.swapaxes(P, -1, -2)) / 2)
@@ -289,12 +288,12 @@ def conditioned(
 def expected(
     mean: np.ndarray, covariance: np.ndarray, own: Pose, transmitter: Gaussian | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (..., 4) and covariance (..., 4, 4) of what will be measured of states (..., 9),
-    measurement noise excluded.
+    """Return mean (..., 4) and covariance (..., 4, 4) of the measurements expected of states
+    (..., 9), without measurement noise.
 
-    Unscented (12 points of position and velocity, equal weights): with a transversal velocity still
-    unknown by 10 m/s and 0.15 s between frames the range rate bends by more than its own deviation,
-    and a linearised gate would lose the target.
+    Unscented transform, with 12 points of position and velocity of equal weight: with a transversal
+    velocity unknown by 10 m/s and 0.15 s between frames, the nonlinearity of the range rate exceeds
+    its deviation, and a linearised gate would lose the target.
     """
     root = np.sqrt(6.0) * np.swapaxes(np.linalg.cholesky(covariance[..., :6, :6]), -1, -2)
     points = mean[..., None, :6] + np.concatenate([root, -root], axis=-2)
@@ -311,8 +310,8 @@ def expected(
 def reported(
     states: Sequence[Gaussian], own: Pose, transmitter: Gaussian | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the measurements of reported targets (K, 4), and their standard deviations (K, 4) by
-    their covariances and, bistatic, the transmitter's."""
+    """Return the expected measurements (K, 4) of reported targets and their standard deviations
+    (K, 4), from the targets' covariances and, bistatic, the transmitter's."""
     if not states:
         return np.zeros((0, 4)), np.zeros((0, 4))
     means, covariances = (np.array(of) for of in zip(*states, strict=True))
@@ -326,8 +325,8 @@ def reported(
 
 
 def wrapped(difference: np.ndarray, ambiguity: Ambiguity) -> np.ndarray:
-    """Differences (..., 2 or 4) of what was measured from what is expected, by the reading of the
-    former that is nearest in velocity."""
+    """Return the differences (..., 2 or 4) between measurement and expectation for the reading of
+    an ambiguous velocity that is nearest to the expected one."""
     period, shift = ambiguity
     if not np.isfinite(period):
         return difference
@@ -341,11 +340,12 @@ def wrapped(difference: np.ndarray, ambiguity: Ambiguity) -> np.ndarray:
 def bistatic_distance(
     length: np.ndarray, baseline: np.ndarray, direction: np.ndarray
 ) -> np.ndarray:
-    """Distance from the receiver to reflectors (...), rho = (L^2 - d^2) / (2 (L - d.u)) [m].
+    """Return the distance from the receiver to reflectors (...), rho = (L^2 - d^2) / (2 (L - d.u))
+    [m].
 
     From |rho u - d| = L - rho; `baseline` d (3,) points from the receiver to the transmitter,
-    `direction` u (..., 3) unit to each reflector. Not positive where the length is not longer than
-    the baseline.
+    `direction` u (..., 3) is the unit vector to each reflector. The result is not positive where
+    the length does not exceed the baseline.
     """
     ahead = direction @ baseline
     return np.asarray((length**2 - baseline @ baseline) / (2 * (length - ahead)))
@@ -360,7 +360,7 @@ def initiate(
     acceleration_std: float,
     ambiguity: Ambiguity = UNAMBIGUOUS,
 ) -> Gaussian | None:
-    """State after a first detection (4,) with deviations (4,); None where it does not fix a
+    """Return the state after a first detection (4,) with deviations (4,); None if it does not fix a
     position (`initiate_all`)."""
     which, states = initiate_all(
         measurement[None],
@@ -373,7 +373,7 @@ def initiate(
     return Gaussian(states.mean[0], states.covariance[0]) if which.size else None
 
 
-@np.errstate(invalid="ignore", divide="ignore")  # in the very place of the transmitter
+@np.errstate(invalid="ignore", divide="ignore")  # a target at the transmitter's position
 def initiate_all(
     measurement: np.ndarray,
     std: np.ndarray,
@@ -383,17 +383,18 @@ def initiate_all(
     acceleration_std: float,
     ambiguity: Ambiguity = UNAMBIGUOUS,
 ) -> tuple[np.ndarray, Gaussian]:
-    """Return the numbers of the detections (Q, 4) with deviations (Q, 4) that fix a position, (K,),
+    """Return the indices (K,) of the detections (Q, 4) with deviations (Q, 4) that fix a position,
     and the states (K, 9) after each.
 
-    Of what the `ambiguity` leaves open the two readings nearest to standing still count, the
-    second ones after all first ones, unless they are faster than UAVs fly. The
-    position from range and direction (front half-space), its covariance through the inverse
-    Jacobian; the velocity is zero in the world with `INITIAL_SPEED_STD` per axis, conditioned on
-    the measured rate: the component along the line of sight (or the bisector) is then known, the
-    others are not. The acceleration is zero with `acceleration_std` [m/s^2] per axis.
+    The position follows from range and direction (front half-space), its covariance from the
+    inverse Jacobian. The velocity is zero in the world with `INITIAL_SPEED_STD` per axis,
+    conditioned on the measured rate, which fixes the component along the line of sight or the
+    bisector. The acceleration is zero with `acceleration_std` [m/s^2] per axis. An ambiguous
+    velocity gives two states, of the two readings nearest to rest; the second ones follow all first
+    ones and are left out above `INITIAL_SPEED_DEVIATIONS`.
     """
     there = None if transmitter is None else transmitter.mean
+    # first reading: nearest to rest; second: one period farther, on the other side of rest
     mean = resting(measurement, own, there)
     off = measurement - measure(mean, own, there)
     near = wrapped(off, ambiguity)
@@ -403,6 +404,7 @@ def initiate_all(
         period, shift = ambiguity
         far = read + np.sign(near[:, 1:2]) * [shift, -period, 0.0, 0.0]
         read, which = np.concatenate([read, far]), np.append(which, which)
+    # readings slow enough whose range and direction fix a position well-conditioned
     mean = resting(read, own, there)
     H = jacobian(mean, own, there)
     speed = np.abs((read - measure(mean, own, there))[:, 1])
@@ -414,6 +416,7 @@ def initiate_all(
     some = np.flatnonzero(fits & np.isfinite(J).all(axis=(1, 2)) & np.isfinite(read).all(axis=1))
     some = some[np.linalg.cond(in_metres[some]) <= 1e6]
     which, mean, read = which[some], mean[some], read[some]
+    # covariance J^-1 R J^-T of the position, with the range's curvature
     R = measurement_covariance(std[which], mean, transmitter)
     back = np.linalg.inv(J[some])
     position = back @ R[:, POSITION[:, None], POSITION] @ np.swapaxes(back, 1, 2)
@@ -429,7 +432,8 @@ def initiate_all(
 
 
 def resting(measurement: np.ndarray, own: Pose, transmitter: np.ndarray | None) -> np.ndarray:
-    """States (Q, 9) of targets at rest where range and direction (Q, 4) place them, or NaN."""
+    """Return the states (Q, 9) of targets at rest at the measured range and direction (Q, 4), or
+    NaN."""
     rho, _, u_x, u_z = measurement.T
     e = own.to_world(np.stack([u_x, np.sqrt(1 - u_x**2 - u_z**2), u_z], axis=1))
     if transmitter is not None:
@@ -448,16 +452,18 @@ def costs(
     ambiguity: Ambiguity,
     probability: float,
 ) -> np.ndarray:
-    """(K, Q) d^2 + ln det S of detections (Q, 4) with deviations against what is `expected` of K
-    tracks, minus twice the log likelihood but for a constant; inf outside the gate in which a
-    detection of the track lies with a `probability`. Components that are NaN were not measured."""
+    """Return d^2 + ln det S (K, Q), minus twice the log-likelihood up to a constant, of detections
+    (Q, 4) with deviations under the measurements `expected` of K tracks; infinite outside the gate,
+    which holds a track's detection with a `probability`. NaN components were not measured."""
     y = wrapped(z[None] - mean[:, None], ambiguity)
     measured = np.isfinite(y)
     y = np.where(measured, y, 0.0)
     most = _gates(probability)[measured.sum(axis=-1)]
     variance = np.fmax(std, STD_FLOOR) ** 2
     own_variance = S[:, None, range(4), range(4)] + variance
-    k, q = np.nonzero((y**2 <= most[..., None] * own_variance).all(axis=-1))  # no other can be in
+    k, q = np.nonzero(
+        (y**2 <= most[..., None] * own_variance).all(axis=-1)
+    )  # necessary for the gate
     both = measured[k, q, :, None] & measured[k, q, None, :]
     A = np.where(both, S[k] + np.eye(4) * variance[q, None], np.eye(4))
     d2, log_det = mahalanobis(y[k, q], A)
@@ -467,8 +473,8 @@ def costs(
 
 
 def mahalanobis(y: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """y^T S^-1 y and ln det S of residuals (N, n) with covariances (N, n, n), by Cholesky's
-    factor."""
+    """Return y^T S^-1 y and ln det S of residuals (N, n) with covariances (N, n, n), by Cholesky
+    factors."""
     L = np.linalg.cholesky(S)
     whitened = np.linalg.solve(L, y[..., None])[..., 0]
     diagonal = np.diagonal(L, axis1=-2, axis2=-1)
@@ -477,5 +483,5 @@ def mahalanobis(y: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=8)
 def _gates(probability: float) -> np.ndarray:
-    """(5,) squared distances by the number of components."""
+    """Return the gates, quantiles of chi-square, for 0 to 4 components (5,)."""
     return 2 * gammaincinv(np.arange(5) / 2, probability)

@@ -1,5 +1,5 @@
-"""The surfaces of a city cut into cells with one scatterer each: functions of mesh, seed and
-flights alone.
+"""Partition of a city's surfaces into cells with one scatterer each, from mesh, seed and flights
+alone.
 
 Faces are halved at their longest edges until a cell's area is small for its distance to the nearest
 flight (`Density`). A hash of the seed, the face's sorted corners and the sequence of halvings gives
@@ -24,10 +24,11 @@ UNIT = 1e-6 * np.sqrt(2)
 """Step of world coordinates before hashing [m]. Irrational: no coordinate of a file lies half-way
 between two steps, where recentring of the city could change its rounding."""
 MOST_CELLS = 8_000_000
+"""Largest number of cells of a run, about 0.5 GB."""
 ALIKE = 1e-9
-"""Edges whose lengths differ by less than this share are equally long; then the first is halved."""
+"""Relative difference up to which edges are equally long; the first of these is halved."""
 FINER = 4.0
-"""Cells near a flight that share the surface of one, where a density asks for it."""
+"""Factor by which cells within `Density.near` of a flight are smaller."""
 
 
 @dataclass(frozen=True)

@@ -96,7 +96,8 @@ class Surfaces(NamedTuple):
 
 @dataclass(frozen=True)
 class Visible(ScatterPaths):
-    """K scatterers of the field between two terminals at one instant, isotropic antennas.
+    """Paths over K scatterers of the field between two terminals at one instant, for isotropic
+    antennas.
 
     Magnitude and acceleration are float32. On a monostatic link both ends share arrays.
 
@@ -148,7 +149,7 @@ def advance(
 
     `start`, `end` (3, 3): position, velocity, acceleration of the ends; `own`: a monostatic link.
     """
-    # geometry of both path segments
+    # length, rate, acceleration and directions: sums over both path segments
     i = rows.cell
     n, first = surfaces.normals[face[i]], motion_to(points[i], start)
     last = first if own else motion_to(points[i], end)
@@ -158,19 +159,20 @@ def advance(
     rows.departure[:], rows.arrival[:] = first[3], last[3]
     u, v = first[3], last[3]
     into, back = (u * n).sum(axis=1), (v * n).sum(axis=1)
-    # share of TE (along u x n) in the power of the vertical field
+    # share of TE, along u x n, in the power of a vertical field: |z . u x n|^2 over the squared
+    # lengths of u x n and of u's horizontal part
     whole = (u[:, 0] ** 2 + u[:, 1] ** 2) * (1 - np.minimum(np.abs(into), 1.0) ** 2)
     across = (n[:, 1] * u[:, 0] - n[:, 0] * u[:, 1]) ** 2
     part = np.where(whole > 1e-12, np.minimum(across / np.maximum(whole, 1e-12), 1.0), 0.5)
-    # mean power gain of the module's docstring, with visibility; 0 through the surface
+    # root of the gain of the module's docstring, times visibility; 0 with the surface in between
     power = scattered_power(surfaces, face[i], area[i], into, back, (u * v).sum(axis=1), part)
     gain = scale * share[i] * np.sqrt(np.maximum(power, 0.0)) / (first[0] * last[0])
     rows.magnitude[:] = np.where(into * back > 0, gain, 0.0)
 
 
 def motion_to(points: np.ndarray, terminal: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the distance (K,) of a terminal (3, 3) in motion from points (K, 3), its rate and
-    acceleration, and the unit vectors towards the points."""
+    """Return the distance r (K,) from a terminal (3, 3) in motion to points (K, 3), its rate
+    -u.v and acceleration (v^2 - rate^2)/r - u.a, and the unit vectors u towards the points."""
     position, velocity, acceleration = terminal
     r = np.linalg.norm(points - position, axis=1)
     u = (points - position) / r[:, None]
@@ -192,12 +194,14 @@ def scattered_power(
     `into` and `back` are the signed cosines of incidence and departure, `between` the cosine of the
     angle between both directions, `part` the share of TE in the power.
     """
+    # reflectivity and norm of the lobe from the material's table
     m, grid = surfaces.material[face], np.linspace(0, 1, surfaces.table.shape[1])
     cosine = np.minimum(np.abs(into), 1.0)
     te, tm, norm = np.empty((3, cosine.size))
-    for one in np.unique(m):
-        for out, column in zip((te, tm, norm), surfaces.table[one].T, strict=True):
-            out[m == one] = np.interp(cosine[m == one], grid, column)
+    for material in np.unique(m):
+        for out, column in zip((te, tm, norm), surfaces.table[material].T, strict=True):
+            out[m == material] = np.interp(cosine[m == material], grid, column)
+    # lobes ((1 + cos psi)/2)^alpha about the mirror direction and towards the source
     lobe, exponent = surfaces.lobe[m], surfaces.exponent[m]
     mirror = np.maximum(0.5 * (1 + 2 * into * back - between), 0.0) ** exponent
     source = np.maximum(0.5 * (1 + between), 0.0) ** exponent
@@ -235,7 +239,7 @@ class ClutterField:
         self.num_candidates = num_candidates
         """Number of cells of the whole city, visible or not."""
         self.overlap = overlap
-        """Visible area in two surfaces or more, which scatters once [m^2]."""
+        """Visible area that lies in two surfaces or more and scatters once [m^2]."""
         self.surfaces = surfaces(city, wavelength)
         self._wavelength, self._scale = wavelength, wavelength / (4 * np.pi)
 
@@ -329,8 +333,9 @@ class ClutterField:
         density: Density,
         positions: np.ndarray,
     ) -> dict[str, dict[str, np.ndarray]]:
-        """Return the cells of each link, merged below its noise (`merging`); `poses` are local, at
-        the instants of `floor`."""
+        """Return the cells of each link, merged below its noise (`merging`); `poses` are those at
+        the instants of `floor`, in local coordinates."""
+        # visibility by rays, at the instants and ever, from each terminal
         cells, visibility, flights = self.cells, self.visibility, self.visibility.flights
         finest = density.finest(cKDTree(positions).query(cells.points)[0])
         error = error_for(density.per_metre)
@@ -344,33 +349,31 @@ class ClutterField:
         }
         merged = {}
         for link, over_noise in floor.over_noise.items():
-            held = ever[link.tx] & ever[link.rx]
+            # cells that both ends see at some time, with their power over the noise at each instant
+            shared = ever[link.tx] & ever[link.rx]
             if not floor.look_back:
-                held &= ever_ahead(flights[link.rx].fronts, cells.points)
-            both = np.flatnonzero(held)
-            some, visible = cells.select(both), []
+                shared &= ever_ahead(flights[link.rx].fronts, cells.points)
+            both = np.flatnonzero(shared)
+            of_link, visible = cells.select(both), []
             for k in np.flatnonzero(over_noise):
                 state = LinkState(link, floor.times[k], poses[link.tx][k], poses[link.rx][k])
                 share = (seen[link.tx][k] & seen[link.rx][k])[both].astype(np.float32)
-                visible.append(self._visible(floor, some, share, state, over_noise[k]))
-            merged[str(link)] = vars(merged_below_noise(some, visible, finest[both], error))
+                visible.append(self._visible(floor, of_link, share, state, over_noise[k]))
+            merged[str(link)] = vars(merged_below_noise(of_link, visible, finest[both], error))
         return merged
 
     def _visible(
         self, floor: NoiseFloor, cells: Cells, share: np.ndarray, state: LinkState, level: float
     ) -> VisibleCells:
-        """Return a link's scatterers with the visibility `share` (N,); `level` is the power of a
-        path over the noise, per power gain."""
+        """Return the scatterers that a link receives, of N with the visibility `share` (N,);
+        `level` is the power over the noise of a path of unit gain."""
         scatter_paths = self._paths_over(cells, share, state)
         power = level * (scatter_paths.magnitude * state.elements(floor.arrays, scatter_paths)) ** 2
         delay = scatter_paths.length / SPEED_OF_LIGHT
-        some = (power > 0) & (delay < floor.longest_delay)
-        rate = scatter_paths.rate[some] / SPEED_OF_LIGHT
-        return VisibleCells(
-            scatter_paths.index[some],
-            power[some],
-            resolution_cell(floor.waveform, delay[some], rate),
-        )
+        received = (power > 0) & (delay < floor.longest_delay)
+        rate = scatter_paths.rate[received] / SPEED_OF_LIGHT
+        cell = resolution_cell(floor.waveform, delay[received], rate)
+        return VisibleCells(scatter_paths.index[received], power[received], cell)
 
     @property
     def nbytes(self) -> int:
@@ -381,8 +384,8 @@ class ClutterField:
         )
 
     def seen(self, state: LinkState, discs: UavDiscs | None = None) -> Visible:
-        """Return the scatterers visible from both ends of a link, poses in local coordinates, with
-        the shadows of `discs`."""
+        """Return the paths over the scatterers visible from both ends of a link, with the shadows
+        of the UAVs `discs`; poses in local coordinates."""
         (tx, rx), own, start, end = state.link, state.link.own, state.start, state.end
         cells, visibility = self.of(state.link)
         share = visibility.share(tx, start, state.epoch)
@@ -406,14 +409,14 @@ class ClutterField:
         return Visible(*(parts[id(a)] for a in vars(found).values()))
 
     def from_places(self, state: LinkState) -> Visible:
-        """Return the scatterers visible from both ends by rays alone, on or off the planned
-        flights; poses in local coordinates."""
+        """Return the paths over the scatterers visible from both ends by rays alone, on or off the
+        planned flights; poses in local coordinates."""
         ends = np.array([state.start.position, state.end.position])
-        one, other = self.visibility.from_places(ends)
-        return self._paths_over(self.cells, (one & other).astype(np.float32), state)
+        share = np.all(self.visibility.from_places(ends), axis=0).astype(np.float32)
+        return self._paths_over(self.cells, share, state)
 
     def _paths_over(self, cells: Cells, share: np.ndarray, state: LinkState) -> Visible:
-        """Return the paths over cells with a visibility `share` (N,) other than 0."""
+        """Return the paths over the cells whose visibility `share` (N,) is not 0."""
         own, start, end = state.link.own, state.start, state.end
         index = np.flatnonzero(share).astype(np.int32)
         count = index.size
@@ -484,10 +487,12 @@ def surfaces(city: CityMesh, wavelength: float) -> Surfaces:
 
 
 def lobe_norm(material: Material, cosine: np.ndarray) -> np.ndarray:
-    """Integrate the lobe ((1 + cos psi)/2)^alpha over the half-space (Degli-Esposti [1]_, eqs. 13
-    and 15).
+    """Integrate the lobe ((1 + cos psi)/2)^alpha over the half-space, at cosines of incidence
+    (Degli-Esposti [1]_, eqs. 13 and 15). The lobe about the incident direction has the same norm.
 
-    The lobes about the mirror and the incident direction have the same exponent and norm.
+    The norm is 2^-alpha times the sum over j of (alpha over j) I_j, with I_j = 2 pi/(j + 1) for
+    even j, and for odd j = 2 n + 1 that times cos(theta) times the sum over i <= n of
+    (2 i over i) sin(theta)^(2 i) / 4^i.
     """
     alpha = material.pattern_exponent
     if material.scattering_pattern == "lambertian":

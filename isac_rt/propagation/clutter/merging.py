@@ -1,26 +1,26 @@
 r"""Merging of scatterers below the noise, link by link.
 
-Let C be the clutter-to-noise ratio of a range-Doppler cell. A relative error of its clutter is an
-error of C/(1 + C) times that of noise plus clutter. Three limits keep the latter within
-`clutter.max_error_db`, e as a share:
+Let C be the clutter-to-noise ratio of a range-Doppler cell. A relative error of its clutter changes
+noise plus clutter by C/(1 + C) of that error. Three limits keep the latter within
+`clutter.max_error_db`, or a share e:
 
-1. Distribution over cells. The error of a cell's clutter grows as area^(3/4) (`cells.area_for`), so
-   one scatterer may represent the area
+1. Mean power of a cell. Its relative error grows as area^(3/4) (`cells.area_for`), so one scatterer
+   may represent the area
 
-.. math:: A \le A_0\,((1 + C)/C)^{4/3},
+   .. math:: A \le A_0\,((1 + C)/C)^{4/3},
 
-   A_0 the area without merging.
-2. Random power. With n scatterers the clutter varies by 1/sqrt(n): the power of one over the noise
-   is at most s (1 + C)^2/C, and at most q (1 + C) in faint cells, with s and q proportional to e^2.
-   Both are set for clutter near the noise, the worst case; a link uses up to six times of both if
-   the 90th percentile of the errors stays within e at all instants.
-3. Speckle. Where C > 1, one scatterer holds at most C/6.
+   with the area A_0 without merging.
+2. Random power. The clutter of n scatterers varies by 1/sqrt(n). The power of one over the noise is
+   therefore at most s (1 + C)^2/C, and at most q (1 + C) in faint cells, with s and q proportional
+   to e^2. Both are set for clutter near the noise, the worst case. A link uses up to six times
+   these values if the 90th percentile of the errors then stays within e at all instants.
+3. Speckle. Where C > 1, one scatterer has at most C/6.
 
-Two halves of a cell merge while their joint area is within the least limit of all scatterers that
-they hold, at all instants of the run. The amplitude of the merged scatterer is the coherent sum,
-weighted by the roots of the areas, which is Gaussian of unit power again. Its position is that of
-one half, drawn by area, so the mean power is right behind shadow edges too. A link is merged once
-for the whole run, without jumps between frames.
+Two halves of a cell merge if their joint area is within the smallest limit of all scatterers in
+them, over all instants of the run. The amplitude of the merged scatterer is the coherent sum,
+weighted by the roots of the areas, and again Gaussian of unit power. Its position is that of one
+half, drawn with a probability proportional to area, so that the mean power is right behind shadow
+edges too. A link is merged once for the whole run: no scatterer changes between frames.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.clutter.cells import Cells
 
 FEWEST = 6
-"""Least number of scatterers in a cell with clutter over the noise."""
+"""Smallest number of scatterers in a cell with clutter over the noise (limit 3)."""
 GROUP_LIMIT = 4.0
-"""s / e^2; merged scatterers are neighbours, mostly in one cell."""
+"""s / e^2 of limit 2; merged scatterers are neighbours and mostly share a cell."""
 SINGLE_LIMIT = 42.0
-"""q / e^2; most cells are faint."""
+"""q / e^2 of limit 2, for faint cells, which are most."""
 LIMIT_FACTORS = (6.0, 3.0, 2.0, 1.0)
 """Factors on s and q, tried in this order; the last is used without a test."""
 
@@ -54,10 +54,10 @@ class NoiseFloor:
     Attributes
     ----------
     waveform, arrays : of the run
-    longest_delay : of a received path [s]
+    longest_delay : largest delay of a received path [s]
     times : (K,) increasing [s]
-    over_noise : by link (K,) power of a path over the noise of a range-Doppler cell, per power
-        gain; 0 where the link is not received
+    over_noise : by link (K,), power of a path of unit gain over the noise of a range-Doppler cell;
+        0 at instants at which the link is not received
     """
 
     waveform: Waveform
@@ -114,32 +114,34 @@ def merged_below_noise(
     error_db : 90th percentile of the error of noise plus clutter
     """
     for factor in LIMIT_FACTORS:
-        limit = np.full(len(cells), np.inf)  # least over the instants
-        for some in visible:
-            area = allowed_area(some, cells.area, finest, 10 ** (error_db / 10) - 1, factor)
-            limit[some.which] = np.minimum(limit[some.which], area)
-        place, left = merge(cells, limit)
+        limit = np.full(len(cells), np.inf)  # smallest over the instants
+        for seen in visible:
+            area = allowed_area(seen, cells.area, finest, 10 ** (error_db / 10) - 1, factor)
+            limit[seen.which] = np.minimum(limit[seen.which], area)
+        index, fewer = merge(cells, limit)
         times = np.zeros(len(cells))
-        times[place] = left.area / cells.area[place]
+        times[index] = fewer.area / cells.area[index]
         if factor == LIMIT_FACTORS[-1] or _within(error_db, times, visible):
             break
-    return left
+    return fewer
 
 
 def _within(error_db: float, times: np.ndarray, visible: Sequence[VisibleCells]) -> bool:
-    """Test the 90th percentile of the error at each instant, over all range-Doppler cells and over
-    those with C > 1, if scatterers represent `times` (N,) their power."""
+    """Test that the 90th percentile of the error is within `error_db` at each instant, over all
+    range-Doppler cells with clutter and over those with C > 1. Each scatterer then has `times` (N,)
+    its power; 0: merged into another."""
     for which, power, cell in visible:
-        every, left = np.bincount(cell, power), np.bincount(cell, power * times[which])
-        held = np.flatnonzero(every)
-        error, loud = difference_db(every[held], left[held]), every[held] > 1
+        before, after = np.bincount(cell, power), np.bincount(cell, power * times[which])
+        occupied = np.flatnonzero(before)
+        error, loud = difference_db(before[occupied], after[occupied]), before[occupied] > 1
         if any(np.quantile(e, 0.9) > error_db for e in (error, error[loud]) if e.size):
             return False
     return True
 
 
 def difference_db(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the difference of noise plus clutter between two clutter-to-noise ratios [dB]."""
+    """Return the difference |10 lg (1 + C_2)/(1 + C_1)| of noise plus clutter between two
+    clutter-to-noise ratios [dB]."""
     return np.abs(10 * np.log10((1 + other) / (1 + one)))
 
 
@@ -150,25 +152,26 @@ def allowed_area(
 
     Parameters
     ----------
-    area : (N,) that each represents [m^2]
+    area : (N,) represented without merging [m^2]
     finest : (N,) A_0 [m^2]
     error : e, of noise plus clutter
-    factor : times that s and q are taken
+    factor : on s and q
 
     Returns
     -------
-    area : (K,) of those that are received [m^2]
+    area : (K,) of the received scatterers [m^2]
     """
     which, power, cell = visible
     clutter = np.bincount(cell, power)[cell]  # C of each scatterer's cell
     over = (1 + clutter) / clutter
+    # largest power of one scatterer by limits 2 and 3, then the area by it and by limit 1
     most = factor * error**2 * (1 + clutter) * np.minimum(SINGLE_LIMIT, GROUP_LIMIT * over)
     most = np.where(clutter > 1, np.minimum(most, clutter / FEWEST), most)
     return np.minimum(finest[which] * over ** (4 / 3), area[which] * most / power)
 
 
 def merge(cells: Cells, limit: np.ndarray) -> tuple[np.ndarray, Cells]:
-    """Merge halves of cells repeatedly while their area is within a limit.
+    """Merge halves of cells repeatedly while their joint area is within a limit.
 
     Parameters
     ----------
@@ -176,21 +179,21 @@ def merge(cells: Cells, limit: np.ndarray) -> tuple[np.ndarray, Cells]:
 
     Returns
     -------
-    place : (M,) index of the cell at whose point each merged cell lies
+    index : (M,) of the cell whose point each merged cell takes
     cells : M merged cells
     """
+    # order of the cells along their faces: by code, its first bit shifted to one place
     halvings = np.frexp(cells.code.astype(float))[1] - 1
     along = cells.code << (62 - halvings).astype(np.uint64)
     order = np.lexsort([along, cells.face])
-    some = cells.select(order)
-    found = merged(
-        some.face, some.code, halvings[order], some.area, some.amplitude, some.clock, limit[order]
+    c = cells.select(order)
+    index, area, amplitude = merged(
+        c.face, c.code, halvings[order], c.area, c.amplitude, c.clock, limit[order]
     )
-    place, area, amplitude = found
-    out = some.select(place)
-    return order[place], replace(
-        out, area=area.astype(np.float32), amplitude=amplitude.astype(np.complex64)
+    out = replace(
+        c.select(index), area=area.astype(np.float32), amplitude=amplitude.astype(np.complex64)
     )
+    return order[index], out
 
 
 def merged(
@@ -202,45 +205,49 @@ def merged(
     clock: np.ndarray,
     limit: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Merge the halves of cells (N,), the finest first, while their area is within the least limit.
+    """Merge halves of cells (N,), the finest first, while their joint area is within the smallest
+    limit of the cells in both.
 
     The half with the smaller `clock`, an exponential variable of rate `area`, gives the point;
-    amplitudes add, weighted by the roots of the areas. Halves that do not merge end the merging of
-    the cells that hold them.
+    amplitudes add, weighted by the roots of the areas. Where two halves do not merge, the cells
+    that hold them do not merge either.
 
     Returns
     -------
-    place, area, amplitude : (M,) merged cells, ordered by the last cell of their parent, the finest
-        first
+    index, area, amplitude : (M,) cell whose point is used, and values of the merged cells, ordered
+        by the last cell of their parent, the finest first
     """
     every = np.arange(len(area))
     sums = (np.sqrt(area) * amplitude).astype(complex)
+    # nodes of the binary trees: face, code, index of the point (-1: does not merge any more), area,
+    # limit, sum of roots of areas times amplitudes, last cell
     nodes = [face, code, every, area.astype(float), limit, sums, every]
-    waiting, left = [part[:0] for part in nodes], []
+    waiting, done = [part[:0] for part in nodes], []
     for level in range(halvings.max(initial=0), -1, -1):
-        # cells of this level, sorted by face and code: halves of one cell are neighbours
+        # nodes of this level, sorted by face and code: halves of one cell are neighbours
         waiting = [
             np.append(w, part[halvings == level]) for w, part in zip(waiting, nodes, strict=True)
         ]
         order = np.lexsort(waiting[1::-1])
-        faces, name, place, size, most, total, last = (part[order] for part in waiting)
-        half = name >> np.uint64(1)
-        one = np.flatnonzero((faces[1:] == faces[:-1]) & (half[1:] == half[:-1]) & (level > 0))
-        other, least = one + 1, np.minimum(most[one], most[one + 1])
-        both = size[one] + size[other]  # joint area
-        joins = (place[one] >= 0) & (place[other] >= 0) & (both <= least)
-        separate = np.stack([one, other], axis=1)[~joins].ravel() if level else np.arange(len(name))
-        last[one] = last[other]
-        left.append(
-            [part[separate] for part in (last, place, size, total)] + [separate * 0 - level]
-        )
-        # merged cells go on to the next level at the point of the half with the smaller clock
-        first = np.where(clock[place[other]] < clock[place[one]], place[other], place[one])
-        place[one], size[one], most[one] = np.where(joins, first, -1), both, least
-        total[one] += total[other]
-        kept = np.setdiff1d(np.arange(len(name)), other)
-        waiting = [part[kept] for part in (faces, half, place, size, most, total, last)]
-    last, place, size, total, fine = (np.concatenate(part) for part in zip(*left, strict=True))
+        faces, codes, index, size, most, total, last = (part[order] for part in waiting)
+        parent = codes >> np.uint64(1)
+        same_parent = (faces[1:] == faces[:-1]) & (parent[1:] == parent[:-1]) & (level > 0)
+        first = np.flatnonzero(same_parent)
+        second, least = first + 1, np.minimum(most[first], most[first + 1])
+        joint = size[first] + size[second]
+        joins = (index[first] >= 0) & (index[second] >= 0) & (joint <= least)
+        # halves that do not merge are results; at level 0 all that is left
+        ends = np.stack([first, second], axis=1)[~joins].ravel() if level else np.arange(len(codes))
+        last[first] = last[second]
+        done.append([part[ends] for part in (last, index, size, total)] + [ends * 0 - level])
+        # parents go on to the next level, merged ones at the point with the smaller clock
+        earlier = clock[index[second]] < clock[index[first]]
+        point = np.where(earlier, index[second], index[first])
+        index[first], size[first], most[first] = np.where(joins, point, -1), joint, least
+        total[first] += total[second]
+        parents = np.setdiff1d(np.arange(len(codes)), second)
+        waiting = [part[parents] for part in (faces, parent, index, size, most, total, last)]
+    last, index, size, total, fine = (np.concatenate(part) for part in zip(*done, strict=True))
     order = np.lexsort([fine, last])
-    order = order[place[order] >= 0]
-    return place[order], size[order], total[order] / np.sqrt(size[order])
+    order = order[index[order] >= 0]
+    return index[order], size[order], total[order] / np.sqrt(size[order])

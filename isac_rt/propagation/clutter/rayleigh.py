@@ -5,18 +5,16 @@ The paper (section V.A) says: Rayleigh amplitudes "with the noise variance as 1"
 over the target's; 40 to 50 consecutive range cells; their centre drawn between 20 and 30 m;
 velocity 0. The choices it leaves open are:
 
-- 10 dB of mean power over the link's reference path: at a PT its line of sight, which the paper
-  calls its target;
-- a run that would begin before cell 1 is moved out, not cut;
-- all is drawn anew in every frame: independent amplitudes from frame to frame, but constant, so
-  coherent, within one;
-- scatterers lie anywhere in their cells, where their sidelobes show;
-- directions are uniform in azimuth and elevation over the field of view. At a terminal's own link
-  a wave leaves where it comes from, between two terminals the two directions are independent;
-- cells are independent of each other.
+- the mean power is 10 dB over the link's reference path: at a PT its line of sight, which the
+  paper calls its target;
+- cells that would begin before cell 1 are shifted, not cut;
+- amplitudes are constant within a frame, so coherent, and independent between frames and cells;
+- scatterers lie at random in their cells, so that their sidelobes show;
+- directions are uniform in azimuth and elevation over the field of view. On a monostatic link
+  departure and arrival are equal, between two terminals they are independent.
 
-Each scatterer is a path of kind DIFFUSE with delay rate 0, static relative to the receiver, as a
-city is for a hovering one only. As an echo of the transmitted chirps it carries their data.
+Each scatterer is a path of kind DIFFUSE with delay rate 0: static relative to the receiver, as a
+city is only for a hovering one. As an echo of the transmitted chirps it carries their data.
 """
 
 from __future__ import annotations
@@ -71,7 +69,7 @@ class RayleighClutter:
         return self.model.census()
 
     def trace(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Traced:
-        """The model's paths and the clutter's; the draw depends on seed, link and epoch."""
+        """Return the paths of the model and of the clutter, drawn by seed, link and epoch."""
         paths, dropped = self.model.trace(poses, epoch, links)
         return Traced(
             {link: merge([p, self._scatterers(p, poses)]) for link, p in paths.items()}, dropped
@@ -98,8 +96,8 @@ class RayleighClutter:
         )
 
     def _directions(self, name: str, count: int, rng: np.random.Generator) -> np.ndarray:
-        """(count, 3) body-frame unit vectors, uniform in azimuth and elevation within a terminal's
-        field of view."""
+        """Draw unit vectors (count, 3) in the body frame, uniform in azimuth and elevation over a
+        terminal's field of view."""
         half_view = self._reference.arrays.of(name).half_view
         azimuth, elevation = rng.uniform(-half_view, half_view, (2, count))
         flat = np.cos(elevation)

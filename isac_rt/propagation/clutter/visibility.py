@@ -1,9 +1,12 @@
 """Visibility of scatterers along a flight.
 
 Shadow rays are tested from time samples, every half metre of the planned flight. Where visibility
-changes between two of them, `penumbra` finds the shadow edge; near it visibility is the modulus of
-the knife-edge factor. Factors of several crossings add as those of the apertures that they bound.
-Visibility is a function of time alone: a frame does not depend on the frames computed before it.
+changes between two of them, `penumbra` finds the shadow edge, near which visibility is the modulus
+of the complex knife-edge factor F. With several crossings, F is the visibility at the nearest time
+sample plus the change of each crossing: +-(F_k at the time - F_k at the time sample), with the
+limits 0 and 1 of F_k at the time sample. This is the field behind the apertures that the edges
+bound. Visibility is a function of time alone: a frame does not depend on frames computed before it.
+
 Import only after `isac_rt.runtime.activate()`.
 """
 
@@ -27,18 +30,19 @@ from isac_rt.world.swarm import Pose, Trajectory
 SAMPLE_SPACING = 0.5
 """Spacing of time samples along a flight [m]."""
 OFF_FLIGHT = 1e-3
-"""Distance from the planned flight beyond which a pose has shadow rays of its own [m]."""
+"""Distance from the planned flight beyond which a pose is tested by shadow rays alone [m]."""
 REACH = 3
-"""Time samples on each side in the blend of visibility over mirrors."""
+"""Time samples on each side over which visibility over mirrors is averaged."""
 AROUND = 8
-"""Time samples on each side whose crossings are included."""
+"""Time samples on each side whose crossings contribute to visibility."""
 SAMPLES_PER_BATCH = 4
 """Time samples tested and cached at a time."""
 BORESIGHT_SAMPLES = 81
 """Instants of a run at which boresights are sampled."""
 WIDEST = (AROUND - 1) / PENUMBRA
-"""Widest penumbra [time samples per Fresnel unit]: it ends within `AROUND` of its crossing."""
+"""Widest penumbra [time samples per Fresnel unit]; it ends within `AROUND` of its crossing."""
 BLEND = BSpline.basis_element(np.arange(-REACH, REACH + 1))
+"""Weights of that average: a quintic B-spline."""
 
 
 class Flight:
@@ -75,8 +79,8 @@ class Flight:
 
     @cached_property
     def fronts(self) -> np.ndarray:
-        """Planes (S, 5) across the boresights of the run: unit normal, offset of the half-space in
-        front of the terminal [m], and largest change of the boresight between two of the
+        """Half-spaces (S, 5) in front of the terminal, one for each boresight of the run: unit
+        normal, offset along it [m], and largest change of the boresight between two of the
         `BORESIGHT_SAMPLES` [rad]."""
         poses = [
             self._trajectory.pose(time) for time in self._times[:: 2000 // (BORESIGHT_SAMPLES - 1)]
@@ -86,10 +90,10 @@ class Flight:
         step, tilt = (
             np.linalg.norm(np.diff(a, axis=0), axis=1).max() for a in (positions, boresights)
         )
-        each, row = np.unique(boresights, axis=0, return_inverse=True)
-        begins = np.full(len(each), np.inf)
+        normals, row = np.unique(boresights, axis=0, return_inverse=True)
+        begins = np.full(len(normals), np.inf)  # at the rearmost position with this boresight
         np.minimum.at(begins, row.ravel(), (positions * boresights).sum(axis=1) - step)
-        return np.column_stack([each, begins, np.full(len(each), tilt)])
+        return np.column_stack([normals, begins, np.full(len(normals), tilt)])
 
     def holds(self, pose: Pose, time: float) -> bool:
         """Test that a pose, local, lies on the planned flight."""
@@ -99,12 +103,12 @@ class Flight:
         )
 
     def number(self, time: float) -> float:
-        """Return the fractional number of the time sample at a time [s]."""
+        """Return the number of time samples until a time [s], with a fraction."""
         return float(np.interp(time, self._times, self._distance) / self.spacing)
 
     def blend(self, time: float) -> dict[int, float]:
-        """Return the time samples about a time [s] with their weights, a quintic B-spline over the
-        flight; the weights sum to one."""
+        """Return the time samples around a time [s] with their weights `BLEND`; the weights sum to
+        one."""
         q = self.number(time)
         nearby = np.arange(np.ceil(q - REACH), q + REACH)
         out: dict[int, float] = {}
@@ -118,8 +122,8 @@ class Flight:
 
 
 def ever_ahead(fronts: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Mark the points (N, 3), local, in front of any of `Flight.fronts` (S, 5), with the margin of
-    boresights between two `BORESIGHT_SAMPLES`."""
+    """Mark the points (N, 3), local, in any of the half-spaces `Flight.fronts` (S, 5), each widened
+    by its change of the boresight times the distance of the farthest point."""
     normals, begins, tilt = np.split(fronts, [3, 4], axis=1)
     farthest = np.linalg.norm(points, axis=1).max(initial=0.0)
     out = np.zeros(len(points), bool)
@@ -129,20 +133,20 @@ def ever_ahead(fronts: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 class _Stretch(NamedTuple):
-    """`SAMPLES_PER_BATCH` time samples of a flight and the next: bits (T + 1, N / 8) of what each
-    sees, and what crosses an edge between two of them."""
+    """Batch of `SAMPLES_PER_BATCH` time samples of a flight and the next one: the points visible
+    from each, packed to bits (T + 1, N / 8), and the crossings between neighbours."""
 
     seen: np.ndarray
     crossed: list[Crossings]
 
 
 class Visibility:
-    """Visibility of N points from each terminal at any time of a run: 0, 1, and the modulus of the
-    knife edge's factor in between.
+    """Visibility of N points from each terminal at any time of a run: 0, 1, or the modulus of the
+    knife-edge factor in a penumbra.
 
     Parameters
     ----------
-    los : for rays
+    los : test of lines of sight by rays
     flights : by terminal
     facets : the N points
     wavelength : [m]
@@ -166,12 +170,12 @@ class Visibility:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the tests and crossings kept."""
+        """Memory of the stored visibility and crossings [bytes]."""
         stretches = self._stretches.values()
-        kept = [vars(c).values() for c in self._nearby.values()]
-        kept += [vars(c).values() for stretch in stretches for c in stretch.crossed]
+        crossed = [vars(c).values() for c in self._nearby.values()]
+        crossed += [vars(c).values() for stretch in stretches for c in stretch.crossed]
         return sum(stretch.seen.nbytes for stretch in stretches) + sum(
-            a.nbytes for c in kept for a in c if isinstance(a, np.ndarray)
+            a.nbytes for values in crossed for a in values if isinstance(a, np.ndarray)
         )
 
     def share(self, name: str, pose: Pose, time: float) -> np.ndarray:
@@ -179,7 +183,7 @@ class Visibility:
         flight = self.flights[name]
         if not flight.holds(pose, time):
             return self.from_places(pose.position[None])[0].astype(np.float32)
-        # rays at the nearest time sample, corrected by the crossings about it
+        # visibility from the nearest time sample
         q = flight.number(time)
         time_sample = int(np.clip(np.rint(q), 0, len(flight.time_samples) - 1))
         if name not in self._nearby or self._nearby[name].time_sample != time_sample:
@@ -189,16 +193,13 @@ class Visibility:
             time_sample % SAMPLES_PER_BATCH
         ]
         out = np.unpackbits(bits, count=len(self._facets.points)).astype(np.float32)
+        # changes of F by the crossings around it, added by scatterer
         if near.row.size:
             step = np.where(near.gained, 1, -1) * (
                 penumbra((q - near.where) / near.width) - (near.where < time_sample)
             )
-            some = (
-                out[near.index]
-                + np.bincount(near.row, step.real)
-                + 1j * np.bincount(near.row, step.imag)
-            )
-            out[near.index] = np.abs(some)
+            real, imaginary = np.bincount(near.row, step.real), np.bincount(near.row, step.imag)
+            out[near.index] = np.abs(out[near.index] + real + 1j * imaginary)
         return out
 
     def from_places(self, positions: np.ndarray) -> np.ndarray:
@@ -206,15 +207,15 @@ class Visibility:
         return self.los.all_seen(positions, self._facets.points, self._facets.normals)
 
     def ever(self, positions: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Return the visibility (N,) bool from any of positions (K, 3), by rays alone; `known` to
-        be visible already."""
+        """Return the visibility (N,) bool from any of positions (K, 3), by rays alone; points
+        `known` (N,) to be visible are not tested."""
         out, left = known.copy(), np.flatnonzero(~known)
         points, normals = self._facets.points[left], self._facets.normals[left]
         out[left] = self.los.ever_sees(positions, points, normals)
         return out
 
     def _near(self, name: str, time_sample: int) -> _Nearby:
-        """Collect the crossings about a time sample."""
+        """Collect the crossings within `AROUND` of a time sample; drop stored batches beyond."""
         flight = self.flights[name]
         spans = range(
             max(time_sample - AROUND, 0), min(time_sample + AROUND, len(flight.time_samples) - 1)
@@ -273,8 +274,8 @@ class Visibility:
 
 @dataclass(frozen=True)
 class _Nearby:
-    """Crossings about one time sample; `index` (R,) are the scatterers, `row` (K,) says which of
-    them each crossing is of; `where` and `width` (K,) are counted in time samples."""
+    """K crossings around one time sample, of R scatterers: indices (R,) of the scatterers, the
+    row (K,) in `index` of each crossing, and its position and sigma (K,) in time samples."""
 
     time_sample: int
     index: np.ndarray
