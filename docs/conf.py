@@ -16,7 +16,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.mathjax",
 ]
-extensions += ["scenario_reference", "licences", "notebooks", "gallery"]
+extensions += ["scenario_reference", "licences", "notebooks", "gallery", "parameters"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_ext"]
 myst_enable_extensions = ["dollarmath"]
