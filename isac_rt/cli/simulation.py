@@ -441,9 +441,9 @@ def export(
         typer.Option(
             "--as",
             metavar="FORMAT",
-            help="csv: tables; mat: MATLAB; pcd: point clouds; glb: 3-D scene; stonesoup: "
-            "detections. IF samples of all frames and links: npy, mat_samples, sigmf, or bin "
-            "(raw data of a DCA1000).",
+            help="csv: tables; mat: MATLAB; pcd, rosbag (ROS 2): point clouds; glb: 3-D scene; "
+            "stonesoup: detections. IF samples of all frames and links: npy, mat_samples, sigmf, "
+            "or bin (raw data of a DCA1000).",
         ),
     ],
     out: Annotated[

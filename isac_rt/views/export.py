@@ -1,5 +1,5 @@
-"""A finished run for other programs: CSV tables, one MAT file, point clouds, a scene as GLB, Stone
-Soup's detections as YAML."""
+"""A finished run for other programs: CSV tables, one MAT file, point clouds as PCD or in a ROS 2
+bag, a scene as GLB, Stone Soup's detections as YAML."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from isac_rt.results.dataset import tracked_states
 from isac_rt.results.recorder import Results
 from isac_rt.storage import write_whole
 from isac_rt.views.interchange import stonesoup_detections
-from isac_rt.views.points import write_points
+from isac_rt.views.points import write_bag, write_points
 from isac_rt.views.scene import path_lines
 from isac_rt.views.style import KIND_COLOURS, colour_of
 from isac_rt.world.city.mesh import CityMesh
@@ -27,7 +27,7 @@ from isac_rt.world.city.mesh import CityMesh
 if TYPE_CHECKING:
     import trimesh
 
-FORMATS = ("csv", "mat", "pcd", "glb", "stonesoup")
+FORMATS = ("csv", "mat", "pcd", "rosbag", "glb", "stonesoup")
 TABLES: dict[str, tuple[str, ...]] = {
     "uavs": ("frame", "uav"),
     "links": ("frame", "observer"),
@@ -242,6 +242,8 @@ def write(results: Results, kind: str, folder: Path, city: Callable[[], CityMesh
         return write_csv(results.dataset, folder)
     if kind == "pcd":
         return write_points(results.dataset, folder)
+    if kind == "rosbag":
+        return write_bag(results.dataset, folder / f"{results.scenario.name}_bag")
     if kind == "stonesoup":
         return write_stonesoup(results.dataset, folder)
     file = folder / f"{results.scenario.name}.{kind}"

@@ -1,20 +1,27 @@
-"""Detections as point clouds: PCD files of every link and frame, and one table."""
+"""Detections as point clouds: PCD files of every link and frame with one table; a ROS 2 bag."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
+from isac_rt.runtime import needed
 from isac_rt.storage import write_whole
 from isac_rt.track.filter import POSITION, jacobian, resting
+from isac_rt.views.samples import staged
 from isac_rt.world.swarm import Pose
 
 _COVARIANCE = ("xx", "xy", "xz", "yy", "yz", "zz")
 _UPPER = np.triu_indices(3)
 _MEASURED = "range", "velocity", "u_x", "u_z"
+_FIELDS = [*"xyz", *(f"cov_{name}" for name in _COVARIANCE), "velocity", "snr", "label"]
+_INT32, _FLOAT32 = 5, 7
+"""Types of `sensor_msgs/msg/PointField`."""
 
 
 def point_cloud(dataset: xr.Dataset) -> pd.DataFrame:
@@ -58,7 +65,7 @@ def point_cloud(dataset: xr.Dataset) -> pd.DataFrame:
                 "target": str(targets[int(d.det_target.values[k])]),
             }
         )
-    return pd.DataFrame(rows)
+    return pd.DataFrame(rows, columns=["frame", "time", "observer", *_FIELDS, "target"])
 
 
 @np.errstate(invalid="ignore", divide="ignore")  # beyond the view, in the place of a terminal
@@ -90,13 +97,74 @@ def write_points(dataset: xr.Dataset, folder: Path) -> list[Path]:
     cloud = point_cloud(dataset)
     files = [folder / "points.csv"]
     write_whole(files[0], cloud.to_csv(index=False, lineterminator="\n"))
-    number = {str(kind): k for k, kind in enumerate(dataset.kind.values)} | {"none": -1}
-    fields = [*"xyz", *(f"cov_{name}" for name in _COVARIANCE), "velocity", "snr", "label"]
     for (observer, frame), part in cloud.groupby(["observer", "frame"]):
-        table = part.assign(label=part.label.map(number))[fields]
+        table = _numbered(dataset, part)
         files.append(folder / f"{str(observer).replace('->', '_to_')}_{frame:04d}.pcd")
-        write_whole(files[-1], _header(fields, len(table)) + _rows(table))
+        write_whole(files[-1], _header(_FIELDS, len(table)) + _rows(table))
     return files
+
+
+def _numbered(dataset: xr.Dataset, part: pd.DataFrame) -> pd.DataFrame:
+    """Return the columns `_FIELDS` of points, the kind of path as its number, -1 for none."""
+    number = {str(kind): k for k, kind in enumerate(dataset.kind.values)} | {"none": -1}
+    return part.assign(label=part.label.map(number))[_FIELDS]
+
+
+def write_bag(dataset: xr.Dataset, folder: Path) -> list[Path]:
+    """Write a bag of ROS 2, a folder: a `PointCloud2` of each frame on a topic `/OBSERVER/points`,
+    in the frame `world`, stamped with the time since the start of the run; fields as in the PCD
+    files.
+
+    Raises
+    ------
+    isac_rt.runtime.MissingPackage  Without the package `rosbags`.
+    isac_rt.storage.StorageError  If the folder cannot be written.
+    """
+    needed("rosbags", "interchange")
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store, cloud = get_typestore(Stores.ROS2_HUMBLE), point_cloud(dataset)
+    kind = "sensor_msgs/msg/PointCloud2"
+    with staged(folder.parent) as made:
+        with Writer(made.stage / folder.name, version=9) as bag:
+            for observer in map(str, dataset.observer.values):
+                topic = f"/{observer.replace('->', '_to_').replace('-', '_')}/points"
+                to = bag.add_connection(topic, kind, typestore=store)
+                for frame, time in zip(dataset.frame.values, dataset.time.values, strict=True):
+                    mine = cloud[(cloud.frame == frame) & (cloud.observer == observer)]
+                    stamp = round(float(time) * 1e9)
+                    message = _message(store.types, _numbered(dataset, mine), stamp)
+                    bag.write(to, stamp, store.serialize_cdr(message, kind))
+        if (folder / "metadata.yaml").is_file():  # an earlier bag
+            shutil.rmtree(folder)
+    return made.files
+
+
+def _message(types: Any, table: pd.DataFrame, stamp: int) -> Any:
+    """Return points as a `PointCloud2` of a time [ns]."""
+    whole = [name == "label" for name in _FIELDS]
+    dtype = [(n, "<i4" if w else "<f4") for n, w in zip(_FIELDS, whole, strict=True)]
+    points = np.zeros(len(table), dtype)
+    for name in _FIELDS:
+        points[name] = table[name]
+    field = types["sensor_msgs/msg/PointField"]
+    fields = [
+        field(name, 4 * i, _INT32 if w else _FLOAT32, 1)
+        for i, (name, w) in enumerate(zip(_FIELDS, whole, strict=True))
+    ]
+    at = types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
+    return types["sensor_msgs/msg/PointCloud2"](
+        header=types["std_msgs/msg/Header"](at, "world"),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=points.itemsize,
+        row_step=points.nbytes,
+        data=np.frombuffer(points.tobytes(), np.uint8),
+        is_dense=True,
+    )
 
 
 def _header(fields: list[str], count: int) -> str:

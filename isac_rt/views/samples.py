@@ -96,7 +96,7 @@ def write_samples(
         w = setup.of(link.tx).waveform
         size += setup.arrays.at(link).num_rx * w.num_groups * w.num_chirps * w.num_samples
     check_folder(folder, size * _WRITERS[form].sample_bytes)
-    with _staged(Path(folder)) as staged:
+    with staged(Path(folder)) as made:
         for done, number in enumerate(frames):
             report(done, len(frames))
             frame = setup.frame(number)
@@ -105,33 +105,35 @@ def write_samples(
                 one = Recorded(name, number, frame.samples(link), setup.arrays.at(link))
                 if link not in writers:
                     count = sum(link in there for there in received.values())
-                    writers[link] = _WRITERS[form](staged.stage, one, count)
+                    writers[link] = _WRITERS[form](made.stage, one, count)
                 writers[link].add(one)
         for writer in writers.values():
             writer.close()
         report(len(frames), len(frames))
-    return staged.files
+    return made.files
 
 
-class _Staged:
+class Staged:
+    """Folder in which files are made, and where they are afterwards."""
+
     def __init__(self, stage: Path) -> None:
         self.stage = stage
         self.files: list[Path] = []
 
 
 @contextmanager
-def _staged(folder: Path) -> Iterator[_Staged]:
+def staged(folder: Path) -> Iterator[Staged]:
     """A hidden folder whose files move into `folder` at the end; nothing is left after a fault."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        staged = _Staged(Path(tempfile.mkdtemp(prefix=".", dir=folder)))
+        made = Staged(Path(tempfile.mkdtemp(prefix=".", dir=folder)))
         try:
-            yield staged
-            for file in sorted(staged.stage.iterdir()):
+            yield made
+            for file in sorted(made.stage.iterdir()):
                 os.replace(file, folder / file.name)
-                staged.files.append(folder / file.name)
+                made.files.append(folder / file.name)
         finally:
-            shutil.rmtree(staged.stage, ignore_errors=True)
+            shutil.rmtree(made.stage, ignore_errors=True)
     except OSError as problem:
         raise StorageError(
             f"cannot write samples into {folder}: {problem.strerror or problem}; choose another "

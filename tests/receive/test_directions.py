@@ -14,6 +14,7 @@ from isac_rt.receive.directions import (
     Search,
     channel_search,
     denominators,
+    inverses,
     receiver_search,
     search_plain,
     search_white,
@@ -141,3 +142,13 @@ def test_denominators_are_the_quadratic_forms_of_the_steering_vectors(antennas, 
     expected = np.einsum("gi,sij,gj->sg", a.conj(), Q, a, optimize=True).real
     found = denominators(Q, search).reshape(18, -1)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4 * expected.mean())
+
+
+@pytest.mark.parametrize("size", [12, 128, 131])
+def test_inverses_of_any_size(size: int):
+    """Against numpy in double precision, on both sides of the change to LAPACK. Planted bugs: one
+    half left out; the other half not conjugated."""
+    rng = np.random.default_rng(8)
+    waves = noise(rng, 3, size, 5).astype(complex)
+    R = (np.eye(size) + 1e4 * waves @ waves.conj().transpose(0, 2, 1)).astype(np.complex64)
+    assert inverses(R) == pytest.approx(np.linalg.inv(R.astype(complex)), abs=1e-5)

@@ -17,7 +17,7 @@ from isac_rt.scenario.tree import Scenario
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare
 from isac_rt.storage import StorageError
-from isac_rt.views.points import point_cloud, write_points
+from isac_rt.views.points import point_cloud, write_bag, write_points
 from isac_rt.views.samples import SampleError, dca1000_words, write_samples
 
 SENSOR = {
@@ -200,3 +200,36 @@ def test_a_run_keeps_its_samples():
     for (frame, link), cube in found.items():
         assert np.array_equal(cube.samples, setup.frame(frame).received(link).samples)
     assert not simulate.run(s, snapshots=0).samples
+
+
+def test_a_bag_holds_the_points(tmp_path):
+    """Read back by rosbags: topics, stamps and fields of each frame, those without points too.
+    Planted bugs: the stamp of the last frame; float64 in fields of four bytes."""
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_typestore
+
+    d, store = fake_run().dataset.load(), get_typestore(Stores.ROS2_HUMBLE)
+    cloud = point_cloud(d)
+    for _ in range(2):  # a second export replaces the first
+        (folder,) = write_bag(d, tmp_path / "run_bag")
+    found = 0
+    with Reader(folder) as bag:
+        assert {c.topic for c in bag.connections} == {f"/{o}/points" for o in d.observer.values}
+        for connection, stamp, raw in bag.messages():
+            message = store.deserialize_cdr(raw, connection.msgtype)
+            part = cloud[cloud.observer == connection.topic.split("/")[1]]
+            part = part[np.isclose(part.time, stamp * 1e-9, atol=1e-8)]
+            points = np.frombuffer(message.data, "<f4").reshape(message.width, 12)
+            assert message.header.frame_id == "world"
+            assert [f.name for f in message.fields][:4] == ["x", "y", "z", "cov_xx"]
+            assert np.allclose(points[:, :3], part[["x", "y", "z"]], rtol=1e-6)
+            assert np.allclose(points[:, 9:11], part[["velocity", "snr"]], rtol=1e-6)
+            found += message.width
+    assert found == len(cloud) > 0
+    assert [file.name for file in tmp_path.iterdir()] == ["run_bag"]
+
+
+def test_no_point_is_a_cloud_too(tmp_path):
+    """Planted bug: a table without columns, which cannot be grouped."""
+    d = fake_run().dataset.load()
+    assert len(write_points(d.isel(detection=slice(0)), tmp_path)) == 1

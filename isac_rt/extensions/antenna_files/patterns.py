@@ -7,6 +7,7 @@ Azimuth counts to the right, elevation upwards. A file that states its gain in d
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,9 @@ DIPOLE_DBI = 2.15
 """Gain of a half-wave dipole, the reference of dBd [dBi]."""
 MAX_DIRECTIONS = 721 * 361
 """Rows of HFSS's table: steps of half a degree."""
+_CUT = re.compile(r"(db\((?:realized)?gaintotal\).*)phi='(-?[\d.]+)deg'")
+"""Column of one cut, as a rectangular plot of HFSS has them: dB(GainTotal) [] - Freq='77GHz'
+Phi='5deg'."""
 MAX_PHI_STEP_DEG = 90.0
 """Largest step of HFSS's Phi: that of the two principal planes."""
 CROSSING_DB = 1.0
@@ -118,23 +122,12 @@ def _summed(
 def _hfss(path: Path, names: Sequence[str]) -> dict[str, Any]:
     """Read a far field of HFSS: Theta from the boresight Z, Phi from X towards Y, which is up (X
     is to the left of who looks along Z)."""
-    starts = "theta", "phi", ("db(gaintotal)", "db(realizedgaintotal)")
-    wanted = tuple(next((n for n in names if n.startswith(s)), "") for s in starts)
-    if "" in wanted:
-        raise ValueError(
-            "its header needs Theta, Phi and dB(GainTotal) or dB(RealizedGainTotal), not "
-            f"{', '.join(names)[:80]!r}; export a data table with Theta and Phi as columns"
-        )
-    rest = tuple(name for name in names if name not in wanted)
-    c = read_csv(path, wanted, rest, most=MAX_DIRECTIONS)
-    if several := [name for name in rest if np.ptp(c[name])]:
-        raise ValueError(f"{several[0][:40]!r} has several values; export one")
-    theta, phi = (np.degrees(c[n]) if "[rad]" in n else np.array(c[n]) for n in wanted[:2])
+    theta, phi, stated = _directions(path, names)
     phi = np.where(theta < 0, phi + 180, phi).round(5) % 360
     theta = np.abs(theta).round(5)
     rows, columns = np.unique(theta), np.unique(phi)
     table = np.full((rows.size, columns.size), np.nan)
-    table[np.searchsorted(rows, theta), np.searchsorted(columns, phi)] = c[wanted[2]]
+    table[np.searchsorted(rows, theta), np.searchsorted(columns, phi)] = stated
     for pole in np.flatnonzero((rows == 0) | (rows == 180)):  # one direction for every Phi
         table[pole] = np.nanmean(table[pole])
     step = np.diff(columns, append=columns[0] + 360).max()
@@ -152,8 +145,33 @@ def _hfss(path: Path, names: Sequence[str]) -> dict[str, Any]:
     right, up, gains = _turned(rows, columns, np.column_stack([table, table[:, 0]]))
     e, a = np.unravel_index(gains.argmax(), gains.shape)
     said = f"peak {gains[e, a]:.1f} dBi at azimuth {right[a]:g}, elevation {up[e]:g} degrees"
-    INPUT_NOTES.info("%s: %s, %s", path.name, wanted[2].split()[0], said)
+    quantity = next(name for name in names if name.startswith("db(")).split()[0]
+    INPUT_NOTES.info("%s: %s, %s", path.name, quantity, said)
     return _absolute(right, up, gains)
+
+
+def _directions(path: Path, names: Sequence[str]) -> tuple[Values, Values, Values]:
+    """Read Theta and Phi [degrees] and gains [dB] (N,) of HFSS: a row for each direction, or a
+    row for each Theta with a column for each Phi."""
+    cuts = {name: cut for name in names if (cut := _CUT.match(name))}
+    starts = ("theta",) if cuts else ("theta", "phi", ("db(gaintotal)", "db(realizedgaintotal)"))
+    wanted = tuple(next((n for n in names if n.startswith(s)), "") for s in starts)
+    if "" in wanted:
+        raise ValueError(
+            "its header needs Theta, Phi and dB(GainTotal) or dB(RealizedGainTotal), not "
+            f"{', '.join(names)[:80]!r}; export a data table with Theta and Phi as columns"
+        )
+    if len({(cut[1], name[cut.end() :]) for name, cut in cuts.items()}) > 1:
+        raise ValueError("has cuts of several frequencies or quantities; export one")
+    rest = tuple(name for name in names if name not in (*wanted, *cuts))
+    c = read_csv(path, (*wanted, *cuts), rest, most=MAX_DIRECTIONS)
+    if several := [name for name in rest if np.ptp(c[name])]:
+        raise ValueError(f"{several[0][:40]!r} has several values; export one")
+    angles = [np.degrees(c[n]) if "[rad]" in n else np.array(c[n]) for n in wanted[:2]]
+    if not cuts:
+        return angles[0], angles[1], np.array(c[wanted[2]])
+    phi = np.repeat([float(cut[2]) for cut in cuts.values()], angles[0].size)
+    return np.tile(angles[0], len(cuts)), phi, np.concatenate([c[name] for name in cuts])
 
 
 def _turned(theta: Values, phi: Values, table: Values) -> tuple[Values, Values, Values]:

@@ -113,6 +113,25 @@ def hfss(unit="deg", column="dB(GainTotal) []", theta=None, phi=None, step=2.0):
     return f'"Freq [GHz]","Phi [{unit}]","Theta [{unit}]","{column}"\n' + "\n".join(rows)
 
 
+def wide(theta, phi, name="dB(GainTotal) [] - Freq='77GHz' Phi='{}deg'"):
+    """Text of a rectangular plot of HFSS: the lobe with a column for each Phi."""
+    _, *rows = hfss(theta=theta, phi=phi).split("\n")
+    gains = np.array([row.rsplit(",", 1)[1] for row in rows]).reshape(len(phi), len(theta))
+    titles = ",".join(f'"{name.format(p)}"' for p in phi)
+    lines = [f"{t},{','.join(row)}" for t, row in zip(theta, gains.T, strict=True)]
+    return "\n".join([f'"Theta [deg]",{titles}', *lines])
+
+
+@pytest.mark.parametrize("theta", [np.arange(0, 181, 2), np.arange(-180, 181, 2)])
+def test_a_column_for_each_phi_is_the_same_table(tmp_path, theta):
+    """Bugs: the cuts row by row; the file's second column as the whole pattern."""
+    phi = np.arange(0, 360 if theta[0] == 0 else 180, 2)
+    found = read(tmp_path, "a.csv", wide(theta, phi)).array
+    rows = read(tmp_path, "b.csv", hfss(theta=theta, phi=phi)).array
+    assert found.pattern == rows.pattern
+    assert found.element_gain_dbi == rows.element_gain_dbi
+
+
 @pytest.mark.parametrize(
     "stated",
     [
@@ -166,6 +185,12 @@ CUTS = "angle_deg,azimuth_db,elevation_db\n"
         ("a.csv", hfss().replace("77", "76", 1), "several values; export one"),
         ("a.csv", hfss(phi=np.arange(0, 91, 2.0)), "no grid of Theta from 0 and of Phi"),
         ("a.csv", hfss(theta=np.arange(10, 91, 2.0)), "no grid of Theta from 0"),
+        ("a.csv", wide(np.arange(0, 91, 2), [0, 180]), "no grid of Theta from 0 and of Phi"),
+        (
+            "a.csv",
+            wide(np.arange(0, 91, 2), [0, 90, 180, 270]).replace("77", "76", 1),
+            "several frequencies",
+        ),
         ("a.csv", hfss(theta=np.zeros(1)), "no grid of Theta from 0"),
         ("a.csv", "\n".join(hfss().split("\n")[:-150]), "no grid of Theta from 0"),
     ],
