@@ -1,11 +1,11 @@
 """Speed against error, method by method, in units of one floor that is measured in the same run.
 
 Every stage has a module with ``rows(quick: bool) -> list[dict[str, object]]``: `synthesis`,
-`reception`, `tracing`, `clutter`, `endtoend`, `datasets` and `hermes`. One that needs what may not
-be installed also has ``missing() -> str | None``, which says why it is left out; one that leaves
-out some of its methods has ``left_out() -> dict[str, str]``, reasons by method; `endtoend` also has
-``commands(quick)``, the parts of whole commands (`command.tables`). A row is one method at one
-size, with these keys:
+`moving`, `reception`, `tracing`, `clutter`, `endtoend`, `datasets` and `hermes`. One that needs
+what may not be installed also has ``missing() -> str | None``, which says why it is left out; one
+that leaves out some of its methods has ``left_out() -> dict[str, str]``, reasons by method;
+`endtoend` also has ``commands(quick)``, the parts of whole commands (`command.tables`). A row is
+one method at one size, with these keys:
 
 kind : str
     The stage, a key of `STAGES`' values.
@@ -36,6 +36,7 @@ REQUIRED = ("kind", "method", "size", "error", "cost", "floor_s")
 """Keys of every row."""
 STAGES = {
     "synthesis": "synthesis",
+    "moving": "moving",
     "receive": "reception",
     "trace": "tracing",
     "clutter": "clutter",

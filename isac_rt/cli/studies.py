@@ -173,7 +173,7 @@ def bench(
         list[str] | None,
         typer.Argument(
             metavar="STAGE",
-            help="Stages: synthesis, receive, trace, clutter, end-to-end, dataset, hermespy.",
+            help="synthesis, moving, receive, trace, clutter, end-to-end, dataset, hermespy.",
         ),
     ] = None,
     quick: Quick = False,

@@ -20,9 +20,6 @@ from isac_rt.kernels.vector import (
     zip_low,
 )
 
-BRIEF = 1e-6
-"""Share of a slot by which the life of a path of one slot may be longer."""
-
 
 class Numbers(NamedTuple):
     """The waveform's numbers in compiled code.
@@ -201,8 +198,8 @@ def one_by_one(waveform: Any, tones: Any) -> OneByOne:
 
 
 def lives_briefly(waveform: Any, tones: Any) -> np.ndarray:
-    """Mark the paths that live for a slot at most (K,)."""
-    return tones.end - tones.begin <= waveform.slot_duration * (1 + BRIEF)
+    """Mark the paths that live for half a frame at most (K,)."""
+    return tones.end - tones.begin <= waveform.frame_duration / 2
 
 
 def _by_slot(

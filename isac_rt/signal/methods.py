@@ -144,7 +144,7 @@ class Gridded:
 class Auto:
     """Synthesis by a method for each path: `Direct` for few paths, else `Gridded` for most.
 
-    Paths that exist for a slot at most are direct. Of many others `Direct` takes
+    Paths that exist for half a frame at most are direct. Of many others `Direct` takes
 
     - lines of sight, whose joint curvature the grid omits;
     - paths too fast for `GRIDDED_ERROR`;

@@ -143,6 +143,8 @@ def _items(setup: Setup, frames: Sequence[int]) -> list[Item]:
     for link, of_link in uses.items():
         items += _link_items(setup, link, of_link)
     items += _unmodelled_items(setup, light, next_slot, short_lived / len(frames))
+    if setup.moving_centres is not None:
+        items += [Item(**row) for row in setup.moving_centres.report()]
     items += [] if setup.has_ideal_hardware else _hardware_items(last)
     return items + _self_calibration_items(setup, last) + _weather_items(setup)
 

@@ -201,7 +201,7 @@ def check_reach(settings: City | None, city: CityMesh, reach: float) -> None:
 def _off_the_ends(polyline: np.ndarray) -> np.ndarray:
     """Shorten a polyline (T, 3) by `TOUCH_M` at both ends, at most to a point."""
     out = polyline.copy()
-    for end, inner in ((0, 1), (-1, -2)):
+    for end, inner in ((0, 1), (-1, -2)) if len(out) > 1 else ():
         step = polyline[inner] - polyline[end]
         length = float(np.linalg.norm(step))
         out[end] += step * min(TOUCH_M / length, 0.5) if length else 0.0

@@ -305,9 +305,8 @@ class Setup:
         (`isac_rt.extensions.street.centres.MovingCentres`); None without."""
         if not any(uav.rotors for uav in self.swarm.uavs.values()):
             return None
-        sections = self.reference.sections
-        make = extension("moving_centres")
-        return make(self.swarm, sections, self.waveform, self.scenario.seed)
+        make, sections = extension("moving_centres"), self.reference.sections
+        return make(self.swarm, sections, self.waveform, self.arrays, self.scenario.seed)
 
     @cached_property
     def calibration(self) -> Any:

@@ -1,4 +1,4 @@
-r"""Moving scattering centres of a UAV, from its echoes: exact delays in every slot.
+r"""Moving scattering centres of a UAV, from its echoes: exact delays within chirps.
 
 A UAV's echoes and ghosts are copied to each centre. With :math:`T'` and :math:`R'` the images of
 the ends of a link as the UAV sees them, over all walls of the path, U the UAV and
@@ -6,20 +6,21 @@ the ends of a link as the UAV sees them, over all walls of the path, U the UAV a
 
 .. math:: \delta(t) = \big(|T'-C| - |T'-U| + |R'-C| - |R'-U|\big)/c
 
-which is exact for mirrors. In a slot it is a polynomial of the second order about the slot's
-middle. The remainder in delay is at most :math:`|\dddot\tau| h^3/6` at a distance of h from there:
+which is exact for mirrors. It is cut into pieces of whole slots, each a polynomial of the second
+order about its middle. The remainder in delay is at most :math:`|\dddot\tau| h^3/6` at h from it:
 :math:`2 v\Omega^2 h^3/(6 c)` for a point that circles at speed v and angular rate :math:`\Omega`,
-1e-15 s or 5e-4 rad for 75 m/s, 6000 rev/min and h = 32 us (`remainder`).
+1e-15 s or 5e-4 rad for 75 m/s, 6000 rev/min and h = 32 us (`remainder`). Pieces are as long as
+`PHASE_ERROR` allows, a slot at least.
 
-Directions and radii at both ends follow the centre; so does spherical spreading. The elements'
-pattern, reflection and shadowing are those of the UAV's path, and edges round which a path bends
-turn with the UAV. Copies are made after the plan's choice of paths and before synthesis alone:
-what scores and draws paths sees the UAV's own.
+Directions and radii at both ends follow the centre from piece to piece; so does spherical
+spreading. The elements' pattern, reflection and occlusion are those of the UAV's path, and edges
+round which a path bends move with the UAV. Copies are made after the plan's choice of paths and
+before synthesis: what scores and draws paths sees the UAV's own, and stored paths stay small.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -28,6 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from isac_rt.extensions.street.motion import CentreModel, Motion
 from isac_rt.extensions.street.rotors import blades_of
+from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathSet, make_paths, merge
 from isac_rt.propagation.rcs import CrossSection
@@ -38,16 +40,24 @@ LEAST_THRUST = 0.1
 """Acceleration of thrust [m/s^2] below which the body's Z axis is left upright: it falls freely."""
 
 
+PHASE_ERROR = 1e-3
+"""Largest phase error [rad] at the ends of a piece; 0.06 % of its samples on average."""
+
+
 def moving_centres(
-    swarm: Swarm, sections: Mapping[str, CrossSection], waveform: Waveform, seed: int
-) -> MovingCentres | None:
-    """Return the moving centres of all UAVs; None if there are none."""
-    models: dict[str, CentreModel] = {
-        name: blades_of(uav.rotors, waveform, seed, name)
+    swarm: Swarm,
+    sections: Mapping[str, CrossSection],
+    waveform: Waveform,
+    arrays: Arrays,
+    seed: int,
+) -> MovingCentres:
+    """Return the moving centres of all UAVs that have any."""
+    models = [
+        (name, blades_of(uav.rotors, waveform, seed, name))
         for name, uav in swarm.uavs.items()
         if uav.rotors is not None
-    }
-    return MovingCentres(swarm, sections, waveform, models) if models else None
+    ]
+    return MovingCentres(swarm, sections, waveform, arrays, models)
 
 
 @dataclass(frozen=True)
@@ -56,74 +66,121 @@ class MovingCentres:
 
     Attributes
     ----------
-    swarm, waveform : of the run
+    swarm, waveform, arrays : of the run
     sections : cross-section of each UAV's own echo
-    models : of centres, by name of the UAV
+    models : of centres, with the name of the UAV each
     """
 
     swarm: Swarm
     sections: Mapping[str, CrossSection]
     waveform: Waveform
-    models: Mapping[str, CentreModel]
+    arrays: Arrays
+    models: Sequence[tuple[str, CentreModel]]
 
     def with_centres(self, paths: PathSet, poses: Mapping[str, Pose], middle: float) -> PathSet:
-        """Return a link's paths with those over centres, one for each slot of a frame.
+        """Return a link's paths with those over centres, piece by piece of the frame.
 
         Parameters
         ----------
         poses : at the paths' epoch
         middle : of the receiver's frame [s]
         """
-        begin, time = self.slots(middle - paths.epoch)
-        parts = [paths]
-        for name, model in self.models.items():
-            if name not in paths.target_names:
-                continue
-            rows = np.flatnonzero(paths.target == paths.target_names.index(name))
-            if rows.size == 0:
-                continue
-            offset = self._in_world(name, model.motion(paths.epoch + time), time, paths.epoch)
-            for row in rows:
-                one = paths.select(np.array([row]))
-                parts.append(self._copies(one, poses, name, offset, (begin, time)))
+        target = np.array([*paths.target_names, ""])[paths.target]
+        gives_way = [name for name, model in self.models if model.replaces_echo]
+        parts = [paths.select(~np.isin(target, gives_way))]
+        for name, model in self.models:
+            rows = np.flatnonzero(target == name)
+            if rows.size:
+                slots = self._slots_of_piece(paths, name, model, poses)
+                begin, time = self.pieces(slots, middle - paths.epoch)
+                offset = self._in_world(name, model.motion(paths.epoch + time), time, paths.epoch)
+                for row in rows:
+                    one = paths.select(np.array([row]))
+                    parts.append(self._copies(one, poses, (name, model), offset, (begin, time)))
         return merge(parts) if len(parts) > 1 else paths
 
-    def slots(self, later: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return when slots begin (T + 1,) and the middles of their samples (T,) [s since the
-        epoch], the middle of the frame `later` than the epoch."""
+    def report(self) -> list[dict[str, Any]]:
+        """Return what the plan says of each model: `Item`'s values by name."""
+        w, out = self.waveform, []
+        widest = 1 / (2 * w.slot_duration)
+        for name, model in self.models:
+            edge = 2 * model.speed / w.wavelength
+            folds = int((edge + widest) // (2 * widest))
+            slot = w.chirp_duration - w.window_start
+            error = 2 * np.pi * (w.carrier_frequency + w.bandwidth) * model.jerk
+            out.append(
+                {
+                    "what": f"moving parts of {name}",
+                    "modelled": f"{model.described()}; Doppler to {edge:.4g} Hz either side, "
+                    f"folded {folds} times into {widest:.4g} Hz by the slots",
+                    "left_out": "jerk within chirps",
+                    "estimate": error * 2 * (slot / 2) ** 3 / (6 * SPEED_OF_LIGHT),
+                    "unit": "rad",
+                }
+            )
+        return out
+
+    def pieces(self, slots: int, later: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return when pieces of so many slots begin and the last ends (T + 1,), and their middles
+        (T,) [s since the epoch], the middle of the frame `later` than the epoch."""
         w = self.waveform
-        begin = np.arange(w.num_chirps + 1) * w.slot_duration - w.frame_duration / 2 + later
-        last = w.chirp_duration + (w.num_groups - 1) * w.group_spacing
-        return begin, begin[:-1] + (w.window_start + last) / 2
+        first = np.append(np.arange(0, w.num_chirps, slots), w.num_chirps)
+        begin = first * w.slot_duration - w.frame_duration / 2 + later
+        samples = w.window_start, w.chirp_duration + (w.num_groups - 1) * w.group_spacing
+        middle = (begin[:-1] + begin[1:] - w.slot_duration + sum(samples)) / 2
+        return (np.array([-np.inf, np.inf]) if middle.size == 1 else begin), middle
+
+    def _slots_of_piece(
+        self, paths: PathSet, name: str, model: CentreModel, poses: Mapping[str, Pose]
+    ) -> int:
+        """Return the number of slots over which delays of the second order and constant directions
+        keep within `PHASE_ERROR`."""
+        w, antennas = self.waveform, self.arrays.at(paths.link)
+        k = 2 * np.pi * (w.carrier_frequency + w.bandwidth) / SPEED_OF_LIGHT
+        reach = [
+            np.linalg.norm(r, axis=1).max() for r in (antennas.tx_positions, antennas.rx_positions)
+        ]
+        ends = [poses[end] for end in paths.link]
+        turning = sum(
+            r
+            * (model.speed + np.linalg.norm(poses[name].velocity - end.velocity))
+            / np.linalg.norm(poses[name].position - end.position)
+            for r, end in zip(reach, ends, strict=True)
+        )
+        by_turning = PHASE_ERROR / max(k * turning, np.finfo(float).tiny)
+        by_delay = (3 * PHASE_ERROR / max(k * model.jerk, np.finfo(float).tiny)) ** (1 / 3)
+        return int(np.clip(2 * min(by_turning, by_delay) / w.slot_duration, 1, w.num_chirps))
 
     def _in_world(self, name: str, own: Motion, time: np.ndarray, epoch: float) -> Motion:
-        """Turn the motion in a body's axes by its attitude, whose rate is constant in a frame."""
+        """Turn the motion in a body's axes by its attitude, to the second order in a frame."""
         half = self.waveform.frame_duration / 2
         before, now, after = (body_axes(self.swarm, name, epoch + t) for t in (-half, 0.0, half))
-        rate = Rotation.from_matrix(after @ before.T).as_rotvec() / (2 * half)
-        axes = Rotation.from_rotvec(time[:, None] * rate).as_matrix() @ now
-        spin = rate @ now  # in body axes
+        ahead, behind = (Rotation.from_matrix(a @ now.T).as_rotvec() for a in (after, before))
+        rate, accel, t = (ahead - behind) / (2 * half), (ahead + behind) / half**2, time[:, None]
+        axes = Rotation.from_rotvec((rate + accel * t / 2) * t).as_matrix() @ now
+        spin, faster = (rate + accel * t)[:, None] @ axes, (accel @ axes)[:, None]  # body axes
         turning = np.cross(spin, own.place)
         velocity = own.velocity + turning
         acceleration = own.acceleration + np.cross(spin, 2 * own.velocity + turning)
+        acceleration += np.cross(faster, own.place)
         return Motion(*(m @ axes.swapaxes(1, 2) for m in (own.place, velocity, acceleration)))
 
     def _copies(
         self,
         base: PathSet,
         poses: Mapping[str, Pose],
-        name: str,
+        of: tuple[str, CentreModel],
         offset: Motion,
         slots: tuple[np.ndarray, np.ndarray],
     ) -> PathSet:
         """Return the copies of one path to all centres in all slots."""
-        begin, time = slots
+        (begin, time), (name, model) = slots, of
         sent, received = end_images(base, poses, name)
         there = segment(sent, time, offset)
         back = there if received is sent else segment(received, time, offset)
-        towards = (poses[name].to_body(image.towards) for image in (sent, received))
+        towards = [poses[name].to_body(image.towards) for image in (sent, received)]
         section = self.sections[name].square_metres(*towards)
-        amplitude = self.models[name].amplitudes() * (base.gain / np.sqrt(section))
+        amplitude = model.amplitudes() * (base.gain / np.sqrt(section))
         rate = (there.rate + back.rate) / SPEED_OF_LIGHT
         accel = (there.accel + back.accel) / SPEED_OF_LIGHT
         t = time[:, None]
@@ -253,7 +310,7 @@ def segment(image: EndImage, time: np.ndarray, offset: Motion) -> Segment:
     centre = Motion(*(u - o for u, o in zip(uav, offset, strict=True)))
     of_uav, of_centre = _distance(uav), _distance(centre)
     rho, q = offset.place, uav.place
-    longer = (rho * (rho - 2 * q)).sum(axis=-1) / (of_centre[0] + of_uav[0])
+    longer = _dot(rho, rho - 2 * q) / (of_centre[0] + of_uav[0])
     rate, accel = (a - b for a, b in zip(of_centre[1:], of_uav[1:], strict=True))
     turn = image.towards - centre.place / of_centre[0][..., None]
     return Segment(of_centre[0], longer, rate, accel, of_uav[0] / of_centre[0], turn)
@@ -262,14 +319,18 @@ def segment(image: EndImage, time: np.ndarray, offset: Motion) -> Segment:
 def _distance(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the length of a vector that moves, and its first and second derivative."""
     place, velocity, acceleration = motion
-    length = np.linalg.norm(place, axis=-1)
-    rate = (place * velocity).sum(axis=-1) / length
-    accel = (velocity * velocity + place * acceleration).sum(axis=-1) - rate * rate
+    length = np.sqrt(_dot(place, place))
+    rate = _dot(place, velocity) / length
+    accel = _dot(velocity, velocity) + _dot(place, acceleration) - rate * rate
     return length, rate, accel / length
 
 
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("...i,...i", a, b)
+
+
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.sqrt(_dot(vectors, vectors))[..., None]
 
 
 def remainder(speed: float, rate: float, half: float) -> float:

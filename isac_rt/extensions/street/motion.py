@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -16,7 +16,25 @@ class Motion(NamedTuple):
 
 
 class CentreModel(Protocol):
-    """Scattering centres that move in the axes of a UAV's body (right, ahead, up)."""
+    """Scattering centres that move in the axes of a UAV's body (right, ahead, up).
+
+    Attributes
+    ----------
+    speed, jerk : largest of all centres against the body [m/s, m/s^3]
+    replaces_echo : the UAV's own point echo is left out
+    """
+
+    replaces_echo: ClassVar[bool]
+
+    @property
+    def speed(self) -> float: ...
+
+    @property
+    def jerk(self) -> float: ...
+
+    def described(self) -> str:
+        """Return what is modelled, in words for the plan."""
+        ...
 
     def amplitudes(self) -> np.ndarray:
         """(K,) square root of each centre's cross-section [m]."""

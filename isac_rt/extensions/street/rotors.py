@@ -21,6 +21,7 @@ reflects 11.4 dB less (Fresnel).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from scipy.special import spherical_jn
@@ -54,6 +55,24 @@ class Blades:
     phase: np.ndarray
     turning: np.ndarray
     amplitude: np.ndarray
+
+    replaces_echo: ClassVar[bool] = False
+
+    @property
+    def speed(self) -> float:
+        """Speed of the fastest point [m/s]."""
+        return float(np.abs(self.radius * self.turning).max())
+
+    @property
+    def jerk(self) -> float:
+        """Largest jerk of a point [m/s^3]."""
+        return float(np.abs(self.radius * self.turning**3).max())
+
+    def described(self) -> str:
+        """Return the blades in words."""
+        each = int((self.hub == self.hub[0]).all(axis=1).sum())
+        ends = np.isclose(self.radius, self.radius.max()).sum()
+        return f"{self.radius.size // each} rotors, {ends} blades as {self.radius.size} points"
 
     def amplitudes(self) -> np.ndarray:
         """(K,) square root of each point's cross-section [m]."""

@@ -1,0 +1,118 @@
+r"""Scattering centres of a pedestrian: a trunk, and limbs that swing as pendulums.
+
+A cycle of two steps lasts :math:`T = 1.346\,H/\sqrt{v H}` at speed v with thighs of length H
+(R. Boulic, N. Magnenat-Thalmann, D. Thalmann, A global human walking model with real-time kinematic
+personification, 1990: relative length of a cycle 1.346 times the root of relative speed). Legs
+swing by :math:`\arcsin(vT/(4L))` about the hips, which spans a step; arms by as much about the
+shoulders in the opposite phase. Knees and elbows stay straight. All centres share the pedestrian's
+cross-section alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from isac_rt.extensions.street.motion import Motion
+
+CYCLE = 1.346
+THIGH, LEG, SHOULDER, ARM = 0.245, 0.53, 0.82, 0.44
+"""Lengths of thigh and leg, height of the shoulders and length of an arm over the body's height
+(Drillis and Contini, Body Segment Parameters, 1966)."""
+HIP_X, SHOULDER_X = 0.055, 0.13
+"""Sideways distance of hip and shoulder from the middle over the body's height."""
+POINTS = {"trunk": 48, "leg": 24, "arm": 16}
+"""Centres of each part: 128 of a pedestrian, 4 cm apart."""
+LARGEST_SWING = np.radians(40.0)
+
+
+@dataclass(frozen=True)
+class Walker:
+    """Points on straight limbs.
+
+    Attributes
+    ----------
+    hinge : (K, 3) place about which each point swings [m, axes of the body: right, ahead, up]
+    length : (K,) distance below the hinge at rest [m]
+    swing : (K,) largest angle ahead [rad]
+    phase : (K,) of the swing at time 0 [rad]
+    rate : angular frequency of the cycle [rad/s]
+    section : cross-section of all points together [m^2]
+    """
+
+    hinge: np.ndarray
+    length: np.ndarray
+    swing: np.ndarray
+    phase: np.ndarray
+    rate: float
+    section: float
+
+    replaces_echo: ClassVar[bool] = True
+
+    @property
+    def speed(self) -> float:
+        """Speed of the fastest point [m/s]."""
+        return float((self.length * self.swing).max() * self.rate)
+
+    @property
+    def jerk(self) -> float:
+        """Bound of the jerk of a point [m/s^3]: swings below a radian keep within twice the first
+        term."""
+        return 2 * self.speed * self.rate**2
+
+    def described(self) -> str:
+        """Return the limbs in words."""
+        return f"trunk and four limbs as {self.length.size} points"
+
+    def amplitudes(self) -> np.ndarray:
+        """(K,) square root of each point's cross-section [m]."""
+        return np.full(self.length.size, np.sqrt(self.section / self.length.size))
+
+    def motion(self, time: np.ndarray) -> Motion:
+        """Return the points' motion in the body's axes at times (T,) [s]."""
+        turn = self.phase + self.rate * time[:, None]
+        angle, rate = self.swing * np.sin(turn), self.swing * self.rate * np.cos(turn)
+        accel = -(self.rate**2) * angle
+        ahead, up = self.length * np.sin(angle), -self.length * np.cos(angle)
+        flat = np.zeros_like(ahead)
+        velocity = np.stack([flat, -up * rate, ahead * rate], axis=-1)
+        acceleration = np.stack(
+            [flat, -up * accel - ahead * rate**2, ahead * accel - up * rate**2], axis=-1
+        )
+        return Motion(self.hinge + np.stack([flat, ahead, up], axis=-1), velocity, acceleration)
+
+
+def walker_of(height: float, speed: float, section: float, start: float) -> Walker:
+    """Return the centres of a pedestrian whose position is the middle of the trunk's foot.
+
+    Parameters
+    ----------
+    height, speed : [m, m/s]
+    section : cross-section [m^2]
+    start : phase of the right leg at time 0 [rad]
+    """
+    thigh, leg = THIGH * height, LEG * height
+    rate = 2 * np.pi * np.sqrt(speed * thigh) / (CYCLE * thigh)
+    step = speed * 2 * np.pi / rate / (4 * leg) if rate else 0.0
+    swing = min(np.arcsin(min(step, 1.0)), LARGEST_SWING)
+    trunk = np.linspace(0, (1 - LEG) * height, POINTS["trunk"])
+    parts = [(np.stack([0 * trunk, 0 * trunk, trunk], axis=1), 0 * trunk, 0.0, 0.0)]
+    for side in (1, -1):
+        for kind, size, x, z in (
+            ("leg", LEG, HIP_X, 0.0),
+            ("arm", ARM, SHOULDER_X, SHOULDER - LEG),
+        ):
+            below = np.linspace(0, size * height, POINTS[kind] + 1)[1:]
+            hinge = np.broadcast_to([side * x * height, 0.0, z * height], (below.size, 3))
+            opposite = (side < 0) != (kind == "arm")
+            parts.append((hinge, below, swing, start + np.pi * opposite))
+    return Walker(
+        np.concatenate([hinge for hinge, *_ in parts]),
+        np.concatenate([below for _, below, _, _ in parts]),
+        np.concatenate([np.full(below.size, angle) for _, below, angle, _ in parts]),
+        np.concatenate([np.full(below.size, phase) for _, below, _, phase in parts]),
+        rate,
+        section,
+    )
