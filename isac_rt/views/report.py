@@ -156,6 +156,7 @@ def write_report(
     span = float(d.time.values[-1] - d.time.values[0]) if d.sizes["frame"] else 0.0
     page = template.render(
         summary=s,
+        passive="passive" in roles,
         span=f"{span:.2f} s",
         roles=", ".join(_count(roles.count(r), _ROLES.get(r, r)) for r in dict.fromkeys(roles)),
         carrier=" and ".join(f"{radio.carrier_hz / 1e9:g} GHz" for radio in radios),

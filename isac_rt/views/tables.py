@@ -30,7 +30,7 @@ def number(value: Any, digits: int = 3) -> str:
         return str(value)
     if isinstance(value, int) or float(value).is_integer():
         return f"{value:,.0f}"
-    return f"{value:.{digits}g}" if abs(value) < 1e4 else f"{value:,.0f}"
+    return f"{value:.{digits}g}" if abs(value) < 1e3 else f"{value:,.0f}"
 
 
 LEGEND = {
@@ -273,10 +273,8 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
     """
     alike: dict[tuple[str, ...], list[str]] = {}
     for of in seen["links"]:
-        row = {
-            **of,
-            "bit_rate_bps": None if of["bit_rate_bps"] is None else of["bit_rate_bps"] / 1e3,
-        }
+        rate = of["bit_rate_bps"]
+        row = {**of, "bit_rate_bps": None if rate is None else rate / 1e3}
         alike.setdefault(tuple(number(row[key]) for key in _COVERAGE.values()), []).append(
             link_words(of["link"])
         )
@@ -292,12 +290,14 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
         for lasts, links in chirps.items()
     )
     interval = number(seen["frame_interval_s"] * 1e3)
+    bistatic = any(len(set(of["link"].split("->"))) > 1 for of in seen["links"])
+    length = ", path length between two terminals" if bistatic else ""
     past = ""
     if farthest["filtered_range_m"] > farthest["max_range_m"]:
         past = "; echoes from up to twice the maximum range disturb some chirps"
     words = (
         f"A slot (one chirp of each group) lasts {durations}, and one starts "
-        f"every {interval} ms. Range: one way for echoes, path length between two terminals{past}. "
+        f"every {interval} ms. Range: one way for echoes{length}{past}. "
         "Faster UAVs alias in velocity. Beam: width of the array's main lobe at boresight. Field "
         "of view: to each side; directions are unambiguous to "
         f"{number(farthest['unambiguous_angle_deg'])} deg. Occlusion is not considered here."
@@ -305,8 +305,7 @@ def coverage_tables(seen: Mapping[str, Any]) -> tuple[Table, str, Table]:
     rows = [
         (
             f"{row['uav']} on {link_words(row['link'])}",
-            *(f"{row[key]}" for key in _OUTSIDE),
-            f"{row['frames']}",
+            *(f"{row[key]}" for key in (*_OUTSIDE, "frames")),
         )
         for row in seen["outside"]
     ]
