@@ -68,7 +68,7 @@ TESTS_OF = {
     "extensions/two_bounces/mirrors.py": "test_two_bounces",
     "propagation/clutter/penumbra.py": "test_penumbra",
     "propagation/clutter/visibility.py": "test_penumbra test_clutter_field test_truths",
-    "propagation/scatter_paths.py": "test_ways test_propagation test_raytrace_scenes",
+    "propagation/scatter_paths.py": "test_scatter_paths test_propagation test_raytrace_scenes",
     "propagation/segments/reflection.py": "test_mirrors test_chains test_raytrace_scenes",
     "propagation/pathset.py": "test_propagation test_ifsignal",
     "propagation/segments/discs.py": "test_diffraction test_shadow_edges",

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError
@@ -101,19 +101,21 @@ class Draw(Free):
 
 
 class Place(Free):
-    """Where the whole swarm is moved to: about the middle of one of the cells of a square grid."""
+    """Displacement of the whole swarm into one of the cells of a square grid."""
+
+    REMOVED: ClassVar[dict[str, str]] = {"turn": "rotate"}
 
     east_m: Range
     """Lowest and highest x of the ground that is used [m]."""
     north_m: Range
-    """The same of y [m]."""
+    """Lowest and highest y of the ground that is used [m]."""
     cell_m: Annotated[float, Field(gt=0)] = 100.0
     """Side of a cell [m]. A flight stays in its cell, and a cell belongs to one split, so that
     splits share no street."""
     up_m: Range = (0.0, 0.0)
-    """By how much the swarm is lifted [m]."""
-    turn: bool = True
-    """Whether the swarm is turned about its middle by a random angle, boresights with it."""
+    """Lowest and highest lift of the swarm [m]."""
+    rotate: bool = True
+    """Rotate the swarm with its boresights about its middle by a random angle."""
 
     def problems(self) -> Iterator[Problem]:
         for name in ("east_m", "north_m", "up_m"):
@@ -303,7 +305,7 @@ def _cells_of(data: DataSet) -> dict[str, list[tuple[float, float]]]:
 def _move(
     tree: dict[str, Any], place: Place, corner: tuple[float, float], rng: np.random.Generator
 ) -> None:
-    """Turn the swarm about its middle and set it into a cell.
+    """Rotate the swarm about its middle and move it into a cell.
 
     Raises
     ------
@@ -311,7 +313,7 @@ def _move(
     """
     points = _flown(tree)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    angle = rng.uniform(0, 2 * np.pi) if place.turn else 0.0
+    angle = rng.uniform(0, 2 * np.pi) if place.rotate else 0.0
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     inside = (points[:, :2] - middle[:2]) @ rotation.T
     low, high = np.array(corner) - inside.min(axis=0), np.array(corner) + place.cell_m
@@ -321,18 +323,18 @@ def _move(
         raise ValueError(f"the flights need {need:.0f} m and place.cell_m is {place.cell_m:g} m")
     to = np.append(rng.uniform(low, high), middle[2] + rng.uniform(*place.up_m))
 
-    def turned(v: Any) -> list[float]:
+    def rotated(v: Any) -> list[float]:
         return [*(rotation @ np.asarray(v[:2], float)).tolist(), float(v[2])]
 
     def moved(v: Any) -> list[float]:
-        return (np.array(turned(np.asarray(v, float) - middle)) + to).tolist()
+        return (np.array(rotated(np.asarray(v, float) - middle)) + to).tolist()
 
     for uav in tree["swarm"].values():
-        for key, change in (("position_m", moved), ("velocity_mps", turned)):
+        for key, change in (("position_m", moved), ("velocity_mps", rotated)):
             if uav.get(key) is not None:
                 uav[key] = change(uav[key])
         if isinstance(uav.get("boresight"), list):
-            uav["boresight"] = turned(uav["boresight"])
+            uav["boresight"] = rotated(uav["boresight"])
         for waypoint in uav.get("waypoints") or ():
             waypoint["position_m"] = moved(waypoint["position_m"])
             if waypoint.get("attitude_deg") is not None:  # yaw counts clockwise

@@ -65,7 +65,7 @@ def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -
         range_words(dataset, observer),
         f"{link_name(dataset, observer)}, frame {number}",
         frameon=True,
-        facecolor="#303030",
+        facecolor="black",
         edgecolor="none",
         labelcolor="white",
     )

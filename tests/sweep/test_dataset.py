@@ -60,6 +60,13 @@ def plan_of(folder: Path, text: str):
     return load_dataset(folder / "set.yaml")
 
 
+def test_an_earlier_key_is_refused_with_its_name_today(folder):
+    """Planted bug: `rotate` without its entry among the removed keys."""
+    text = SET.replace("cell_m: 18", "cell_m: 18, turn: false")
+    with pytest.raises(ScenarioError, match="place.turn.*rotate"):
+        plan_of(folder, text)
+
+
 def test_splits_share_no_street_and_no_flight(folder):
     """Where every UAV is at the first and the last frame, from the drawn numbers by hand: all of a
     scene in one cell of the grid, and no cell in two splits; shares to the scene. Planted bugs: the

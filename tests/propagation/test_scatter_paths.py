@@ -1,4 +1,4 @@
-"""Ways in two segments, and which element at which end weighs them, by hand."""
+"""Paths of two segments, and the element at each end that weighs them, by hand."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from isac_rt.world.swarm import Pose
 COSINE = Antennas(tx_x=1, tx_z=1, rx_x=2, rx_z=2, spacing=1e-3, gain=4.0, pattern="cosine")
 """4 cos(angle): q = 4/2 - 1."""
 SENDER = Pose.at_rest((3, 4, 20), boresight=(0, 1, 0))
-HEARER = Pose.at_rest((30, 4, 20), boresight=(-1, 0, 0))
+RECEIVER = Pose.at_rest((30, 4, 20), boresight=(-1, 0, 0))
 
 
 def unit(*v: float) -> np.ndarray:
@@ -41,11 +41,11 @@ def test_a_path_over_a_target_adds_its_segments():
     """Length, rate and acceleration of both; the wave curves about the body at either end, and
     leaves and comes by the segments' first pieces. Planted bugs: ends exchanged; one segment's
     acceleration."""
-    way = ScatterPaths.over(*segments())
-    assert (way.length[0], way.rate[0], way.accel[0]) == pytest.approx((46.0, -4.5, 1.4))
-    assert (way.tx_radius[0], way.rx_radius[0]) == (17.0, 29.0)
-    assert way.departure[0].tolist() == [0.6, 0.8, 0.0]
-    assert way.arrival[0] == pytest.approx([-0.8, 0.0, 0.6])
+    path = ScatterPaths.over(*segments())
+    assert (path.length[0], path.rate[0], path.accel[0]) == pytest.approx((46.0, -4.5, 1.4))
+    assert (path.tx_radius[0], path.rx_radius[0]) == (17.0, 29.0)
+    assert path.departure[0].tolist() == [0.6, 0.8, 0.0]
+    assert path.arrival[0] == pytest.approx([-0.8, 0.0, 0.6])
     one = ScatterPaths.along(segments()[0])
     assert (one.length[0], one.tx_radius[0], one.rx_radius[0]) == (17.0, 17.0, 17.0)
     assert one.departure[0].tolist() == [0.6, 0.8, 0.0] and one.arrival[0].tolist() == [-1, 0, 0]
@@ -53,16 +53,16 @@ def test_a_path_over_a_target_adds_its_segments():
 
 @pytest.mark.parametrize("own", [False, True])
 def test_each_end_weighs_by_its_own_axes(own):
-    """The sender looks north, 0.8 of the way it leaves by; the receiver west, 0.8 of where it comes
+    """The sender looks north, 0.8 of the departure; the receiver west, 0.8 of where it comes
     from; at an active terminal both in the terminal's own axes, by different directions there and
     back as over a wall. Planted bugs: the arrival in the sender's axes; the departure's gain
     twice."""
-    way = ScatterPaths.over(*segments())
-    end = SENDER if own else HEARER
+    path = ScatterPaths.over(*segments())
+    end = SENDER if own else RECEIVER
     state = LinkState(Link("A", "A" if own else "B"), 0.0, SENDER, end)
-    arrival = 4 * max(way.arrival[0] @ end.rotation[:, 1], 0)
+    arrival = 4 * max(path.arrival[0] @ end.rotation[:, 1], 0)
     assert arrival == pytest.approx(0.0 if own else 3.2)
-    assert state.elements(Arrays(COSINE), way)[0] == pytest.approx(np.sqrt(3.2 * arrival))
+    assert state.elements(Arrays(COSINE), path)[0] == pytest.approx(np.sqrt(3.2 * arrival))
     there = segments()[0]
     bent = ScatterPaths.over(there, segment((29.0, -7.0, 1.1), unit(0, 0.6, 0.8), unit(0, 1, 0)))
     straight = ScatterPaths.over(there, there)
@@ -71,21 +71,21 @@ def test_each_end_weighs_by_its_own_axes(own):
         assert state.elements(Arrays(COSINE), straight)[0] == pytest.approx(3.2)
 
 
-def test_paths_are_their_ways_over_the_speed_of_light():
+def test_delays_are_lengths_over_the_speed_of_light():
     """Delays, directions and radii of the paths, their names and what happens on them. Planted
     bugs: metres for seconds; directions exchanged."""
-    way = ScatterPaths.over(*segments())
-    state = LinkState(Link("A", "B"), 0.7, SENDER, HEARER, ("T", "U"))
+    path = ScatterPaths.over(*segments())
+    state = LinkState(Link("A", "B"), 0.7, SENDER, RECEIVER, ("T", "U"))
     points, faces = np.array([[[1.0, 2, 3]]]), np.array([[5]])
     p = state.paths(
-        way, np.array([2j]), PathKind.GHOST, bounces=1, target=1, points=points, faces=faces
+        path, np.array([2j]), PathKind.GHOST, bounces=1, target=1, points=points, faces=faces
     )
     c = 299_792_458.0
     found = p.delay[0] * c, p.delay_rate[0] * c, p.delay_accel[0] * c
     assert found == pytest.approx((46.0, -4.5, 1.4))
     assert (p.tx_radius[0], p.rx_radius[0], p.gain[0]) == (17.0, 29.0, 2j)
-    assert p.departure.tolist() == way.departure.tolist()
-    assert p.arrival.tolist() == way.arrival.tolist()
+    assert p.departure.tolist() == path.departure.tolist()
+    assert p.arrival.tolist() == path.arrival.tolist()
     assert (p.tx, p.rx, p.epoch, p.target_names) == ("A", "B", 0.7, ("T", "U"))
     assert (p.kind[0], p.bounces[0], p.target[0], p.faces[0, 0]) == (2, 1, 1, 5)
     assert p.points.tolist() == points.tolist()
