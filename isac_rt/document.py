@@ -149,8 +149,8 @@ class _Reader:
             below = (*key, name.value)
             if name.value in values:
                 first = self.places[below]
-                said = f"stands here a second time (first in line {first}); remove one"
-                raise _fault(name, f"the key {dotted(below)} {said}")
+                message = f"stands here a second time (first in line {first}); remove one"
+                raise _fault(name, f"the key {dotted(below)} {message}")
             self.places[below] = self._place or name.start_mark.line + 1
             values[name.value] = self._value(item, below, depth + 1)
         return merged | values
@@ -202,13 +202,13 @@ def _yaml_complaint(error: yaml.YAMLError, text: str) -> tuple[int | None, str]:
     """Line and wording of what PyYAML or `_Reader` did not like."""
     if isinstance(error, yaml.MarkedYAMLError):
         mark = error.problem_mark or error.context_mark
-        said = error.problem or error.context or "cannot be read"
+        message = error.problem or error.context or "cannot be read"
         lines = text.split("\n")
         if mark and mark.line < len(lines) and lines[mark.line][mark.column :].startswith("\t"):
-            said = "a tab stands where YAML wants spaces; indent with spaces"
-        elif error.context and error.problem_mark is not None and error.context not in said:
-            said = f"{said} ({error.context})"
-        return (mark.line + 1 if mark else None), said
+            message = "a tab stands where YAML wants spaces; indent with spaces"
+        elif error.context and error.problem_mark is not None and error.context not in message:
+            message = f"{message} ({error.context})"
+        return (mark.line + 1 if mark else None), message
     if isinstance(error, yaml.reader.ReaderError):
         at = yaml.reader.Reader.NON_PRINTABLE.search(text)
         assert at is not None
@@ -231,12 +231,12 @@ def _text_of(path: Path) -> str:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
-            said = f"has {size} bytes, a scenario has at most {MAX_BYTES}; is it the right file?"
-            raise ScenarioError(f"{path}: {said}")
+            message = f"has {size} bytes, a scenario has at most {MAX_BYTES}; is it the right file?"
+            raise ScenarioError(f"{path}: {message}")
         data = path.read_bytes()
     except OSError as error:
-        said = f"cannot be read: {error.strerror}; check its permissions"
-        raise ScenarioError(f"{path}: {said}") from None
+        message = f"cannot be read: {error.strerror}; check its permissions"
+        raise ScenarioError(f"{path}: {message}") from None
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -273,13 +273,13 @@ class Document:
         try:
             data = reader.parse(text)
         except yaml.YAMLError as error:
-            line, said = _yaml_complaint(error, text)
-            raise ScenarioError(f"{path}{f':{line}' if line else ''}: {said}") from None
+            line, message = _yaml_complaint(error, text)
+            raise ScenarioError(f"{path}{f':{line}' if line else ''}: {message}") from None
         if data is None:
             raise ScenarioError(f"{path}: is empty; {needs}")
         if not isinstance(data, dict):
-            said = f"must be a mapping of keys ({needs}), not {_shown(data)}"
-            raise ScenarioError(f"{path}:{reader.places[()]}: {said}")
+            message = f"must be a mapping of keys ({needs}), not {_shown(data)}"
+            raise ScenarioError(f"{path}:{reader.places[()]}: {message}")
         self.path = path
         self.data: dict[str, Any] = data
         self.places = reader.places
@@ -324,14 +324,14 @@ class Document:
         name, equals, written = text.partition("=")
         parts = name.strip().split(".")
         if not equals or "" in parts:
-            said = "must be key=value, with a dotted key such as radio.groups=2"
-            raise ScenarioError(f"{option}: {said}")
+            message = "must be key=value, with a dotted key such as radio.groups=2"
+            raise ScenarioError(f"{option}: {message}")
         reader = _Reader(option)
         try:
             value = reader.parse(written, tuple(parts))
         except yaml.YAMLError as error:
-            said = _yaml_complaint(error, written)[1]
-            raise ScenarioError(f"{option}: the value cannot be read: {said}") from None
+            message = _yaml_complaint(error, written)[1]
+            raise ScenarioError(f"{option}: the value cannot be read: {message}") from None
         here, key = self._locate(parts, option)
         here[key[-1]] = value
         for old in [place for place in self.places if place[: len(key)] == key]:
@@ -355,8 +355,8 @@ class Document:
             elif isinstance(here, dict):
                 key = (*key, part)
             else:
-                said = f"is {_shown(here)}, which has no keys below it; check the key"
-                raise ScenarioError(f"{option}: {dotted(key)} {said}")
+                message = f"is {_shown(here)}, which has no keys below it; check the key"
+                raise ScenarioError(f"{option}: {dotted(key)} {message}")
             if i + 1 < len(parts):
                 if isinstance(here, dict) and here.get(part) is None:
                     here[part] = {}

@@ -664,7 +664,7 @@ OF_TESTS = (
     ),
     (
         "test_keys::test_keys_hold_every_value_of_a_scenario",
-        Bug("results/provenance.py", '    "compare",\n)', '    "compare",\n    "swarm",\n)'),
+        Bug("results/provenance.py", '    "compare",\n', '    "compare",\n    "swarm",\n'),
     ),
     (
         "test_keys::test_keys_hold_every_value_of_a_scenario",
@@ -768,8 +768,8 @@ OF_TESTS = (
         "test_interchange::test_the_ledger_has_positive_doppler_of_what_comes_nearer",
         Bug(
             "views/interchange.py",
-            "lambda p: -carrier_frequency * p.delay_rate",
-            "lambda p: carrier_frequency * p.delay_rate",
+            "lambda p: -carrier_frequency[p.tx] * p.delay_rate",
+            "lambda p: carrier_frequency[p.tx] * p.delay_rate",
         ),
     ),
     (

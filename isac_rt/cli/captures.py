@@ -215,12 +215,12 @@ def receive(
         farthest = float(dataset.map_range[-1]) / (2 if capture.one_sided else 1)
         write_figure(out / "range_azimuth.png", drawn(range_azimuth(capture, view, farthest)))
     confirmed = np.unique(dataset.track_id.values[dataset.track_confirmed.values])
-    said = f"{dataset.sizes['detection']} detections in {len(captures)} frames"
+    message = f"{dataset.sizes['detection']} detections in {len(captures)} frames"
     if len(captures) > 1:
-        said += f", {len(confirmed)} confirmed tracks"
+        message += f", {len(confirmed)} confirmed tracks"
         if interval is None:
-            said += "; state frame_interval_ms in the description for tracks"
-    say(said)
+            message += "; state frame_interval_ms in the description for tracks"
+    say(message)
     say(f"in {out}: reception.nc, range_doppler.png, range_azimuth.png")
 
 
@@ -234,12 +234,12 @@ def _recorded(
 
     if not _is_imported(file, description):
         return [_calibrated(_opened(file, description), calibration)], None
-    said = None if description is None else load_description(description)
+    described = None if description is None else load_description(description)
     with working("reading the samples"):
-        frames = import_frames(file, said)
+        frames = import_frames(file, described)
     interval = None
-    if said is not None and said.frame_interval_ms is not None:
-        interval = said.frame_interval_ms * 1e-3
+    if described is not None and described.frame_interval_ms is not None:
+        interval = described.frame_interval_ms * 1e-3
     if calibration is None:
         return frames, interval
     found = load_calibration(calibration)

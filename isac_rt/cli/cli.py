@@ -197,8 +197,8 @@ def _main(arguments: Sequence[str]) -> int:
             _complain(str(problem))
             return 2
         if of_machine(problem):
-            said = str(problem) or "there is no more memory"
-            _complain(f"{type(problem).__name__}: {said} (the machine's disk or memory)")
+            message = str(problem) or "there is no more memory"
+            _complain(f"{type(problem).__name__}: {message} (the machine's disk or memory)")
             return 2
         _complain(
             f"{type(problem).__name__}: {problem} (this is a fault of isac_rt; {DEBUG}=1 shows "

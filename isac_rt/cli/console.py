@@ -191,8 +191,8 @@ class _Lines:
             parts += [self._step] if self._step else []
             parts += [f"{passed:.0f} s"] if passed >= 1 else []
             parts += [left] if (left := self._pace.left(self._total)) else []
-            said = f"{self._what}: {', '.join(parts)}" if parts else self._what
-            err().print(said, soft_wrap=True)
+            message = f"{self._what}: {', '.join(parts)}" if parts else self._what
+            err().print(message, soft_wrap=True)
 
 
 @contextmanager

@@ -301,8 +301,8 @@ def _say_plan(found: dict[str, Any]) -> None:
         "weakest [dB under the noise of a cell]": found["weakest_path_db"],
         "reach [m]": found["reach_m"],
     }
-    said = ", ".join(f"{name}: {value}" for name, value in settled.items() if value is not None)
-    say(f"preset {found['preset']}; {said}")
+    message = ", ".join(f"{name}: {value}" for name, value in settled.items() if value is not None)
+    say(f"preset {found['preset']}; {message}")
 
 
 def paths(

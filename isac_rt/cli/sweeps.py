@@ -146,8 +146,8 @@ def dataset(
             "scenes", partial(run_dataset, plan, folder, workers=workers, scheduler=scheduler)
         )
     counts = {name: (len(shards), sum(shards.values())) for name, shards in card["splits"].items()}
-    said = ", ".join(f"{name}: {s} scenes, {n:,} samples" for name, (s, n) in counts.items())
-    say(f"{said}; {card['bytes'] / 1e6:,.1f} MB, {card['scenes_failed']} scenes failed")
+    message = ", ".join(f"{name}: {s} scenes, {n:,} samples" for name, (s, n) in counts.items())
+    say(f"{message}; {card['bytes'] / 1e6:,.1f} MB, {card['scenes_failed']} scenes failed")
     spent = card["processor_s"]
     if total := spent.pop("total", 0.0):
         parts = (f"{name} {seconds / total:.0%}" for name, seconds in spent.items())

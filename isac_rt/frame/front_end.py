@@ -37,20 +37,20 @@ class Oscillator(Node):
     def problems(self) -> Iterator[Problem]:
         for i, (before, after) in enumerate(itertools.pairwise(self.mask_dbc_hz), start=1):
             if after[0] <= before[0]:
-                said = (
+                text = (
                     f"an offset of {after[0]:g} Hz does not follow {before[0]:g} Hz; put the "
                     "points in the order of their offsets"
                 )
-                yield Problem((("mask_dbc_hz", i),), said)
+                yield Problem((("mask_dbc_hz", i),), text)
             elif after[1] > before[1]:
-                said = (
+                text = (
                     f"the mask rises from {before[1]:g} dBc/Hz to {after[1]:g} dBc/Hz; phase noise "
                     "falls or stays with the offset from the carrier"
                 )
-                yield Problem((("mask_dbc_hz", i),), said)
+                yield Problem((("mask_dbc_hz", i),), text)
         if self.mask_dbc_hz and not self.locked and len(self.mask_dbc_hz) < 2:
-            said = "a free oscillator needs two points or more, whose slope goes on to the carrier"
-            yield Problem((("mask_dbc_hz",), ("locked",)), said)
+            text = "a free oscillator needs two points or more, whose slope goes on to the carrier"
+            yield Problem((("mask_dbc_hz",), ("locked",)), text)
 
 
 Degrees = Annotated[float, Field(ge=-3600, le=3600, allow_inf_nan=False)]
@@ -177,8 +177,8 @@ class Ramp(Node):
     def problems(self) -> Iterator[Problem]:
         for name in ("quadratic_hz", "ripple_hz"):
             if not abs(getattr(self, name)) <= FARTHEST_HZ:
-                said = f"is no error of a ramp but another one; at most {FARTHEST_HZ:g} Hz"
-                yield Problem(((name,),), said)
+                text = f"is no error of a ramp but another one; at most {FARTHEST_HZ:g} Hz"
+                yield Problem(((name,),), text)
 
 
 class Shifter(Node):
@@ -204,11 +204,11 @@ class Shifter(Node):
     def problems(self) -> Iterator[Problem]:
         if (self.errors_deg or self.errors_std_deg) and self.bits is None:
             name = "errors_deg" if self.errors_deg else "errors_std_deg"
-            said = "is of steps of which there are none; state bits, or leave it out"
-            yield Problem(((name,), ("bits",)), said)
+            text = "is of steps of which there are none; state bits, or leave it out"
+            yield Problem(((name,), ("bits",)), text)
         elif self.bits is not None and len(self.errors_deg) not in (0, 2**self.bits):
-            said = f"{len(self.errors_deg)} values for the {2**self.bits} steps of {self.bits} bits"
-            yield Problem((("errors_deg",), ("bits",)), f"{said}; state one of each step")
+            text = f"{len(self.errors_deg)} values for the {2**self.bits} steps of {self.bits} bits"
+            yield Problem((("errors_deg",), ("bits",)), f"{text}; state one of each step")
 
 
 class Converter(Node):
@@ -248,8 +248,8 @@ class Converter(Node):
 
     def problems(self) -> Iterator[Problem]:
         if self.full_scale_dbm is not None and self.bits is None:
-            said = "is the full scale of converters without bits; state bits, or leave it out"
-            yield Problem((("full_scale_dbm",), ("bits",)), said)
+            text = "is the full scale of converters without bits; state bits, or leave it out"
+            yield Problem((("full_scale_dbm",), ("bits",)), text)
 
     def powers(self) -> Iterator[str]:
         """Keys that state a power at the input."""
@@ -329,9 +329,9 @@ class FrontEnd(Node):
     def _with_preset(cls, data: Any) -> Any:
         """Fill in what the preset says of keys that are not stated."""
         name = data.get("preset") if isinstance(data, dict) else None
-        said = PRESETS.get(name, {}) if isinstance(name, str) else {}
-        out = dict(data) if said else data
-        for part, keys in said.items():
+        parts = PRESETS.get(name, {}) if isinstance(name, str) else {}
+        out = dict(data) if parts else data
+        for part, keys in parts.items():
             stated = out.get(part, {})
             stated = stated.model_dump() if isinstance(stated, Node) else stated
             if isinstance(stated, dict):

@@ -244,20 +244,20 @@ class Radio(Node):
         if self.mode == "isac":
             for key in ("chirp", "sub_bands"):
                 if getattr(self, key) is not None:
-                    said = "has no meaning with mode isac; set radio.mode: fmcw, or leave it out"
-                    yield Problem(((key,), ("mode",)), said)
+                    text = "has no meaning with mode isac; set radio.mode: fmcw, or leave it out"
+                    yield Problem(((key,), ("mode",)), text)
             return
         if self.groups != 1:
-            said = f"{self.groups} groups carry data, which mode fmcw has none of; leave it out"
-            yield Problem((("groups",), ("mode",)), said)
+            text = f"{self.groups} groups carry data, which mode fmcw has none of; leave it out"
+            yield Problem((("groups",), ("mode",)), text)
         if self.sub_bands is None:
             return
         if self.scheme in ("simo", "tdm"):
-            said = f"has no meaning with scheme {self.scheme}, only with ddm or bpm; leave it out"
-            yield Problem((("sub_bands",), ("scheme",)), said)
+            text = f"has no meaning with scheme {self.scheme}, only with ddm or bpm; leave it out"
+            yield Problem((("sub_bands",), ("scheme",)), text)
         elif self.scheme == "bpm" and self.sub_bands & (self.sub_bands - 1):
-            said = "must be a power of two with scheme bpm, the length of a Hadamard code"
-            yield Problem((("sub_bands",), ("scheme",)), said)
+            text = "must be a power of two with scheme bpm, the length of a Hadamard code"
+            yield Problem((("sub_bands",), ("scheme",)), text)
 
     def _chirp_problems(self) -> Iterator[Problem]:
         if self.chirp is None or self.mode == "isac":
@@ -265,8 +265,8 @@ class Radio(Node):
         c, sampled = self.chirp, self.samples_per_chirp / self.sampling_rate_hz
         follows = c.slope_mhz_per_us * 1e12 * self.ramp_end_s
         if not abs(self.bandwidth_hz - follows) <= STATED_SHARE * follows < math.inf:
-            said = f"but {follows:g} follows from radio.chirp; leave one of the two out"
-            yield Problem((("bandwidth_hz",), ("chirp",)), said)
+            text = f"but {follows:g} follows from radio.chirp; leave one of the two out"
+            yield Problem((("bandwidth_hz",), ("chirp",)), text)
         last = c.adc_start_us * 1e-6 + sampled
         if last > self.ramp_end_s * (1 + 1e-9):
             yield Problem(
@@ -338,21 +338,21 @@ class Elements(Node):
 
     def problems(self) -> Iterator[Problem]:
         if self.file is not None:
-            said = "is read by isac_rt.load, which was not used; state positions"
-            yield Problem((("file",),), said)
+            text = "is read by isac_rt.load, which was not used; state positions"
+            yield Problem((("file",),), text)
         elif self.shape == "positions" and not self.positions:
-            said = "missing: shape positions needs one element or more; add positions or file"
-            yield Problem((("positions",), ("shape",)), said)
+            text = "missing: shape positions needs one element or more; add positions or file"
+            yield Problem((("positions",), ("shape",)), text)
         if self.shape != "positions" and self.positions is not None:
-            said = f"has no meaning with shape {self.shape}; leave it out, or set shape: positions"
-            yield Problem((("positions",), ("shape",)), said)
+            text = f"has no meaning with shape {self.shape}; leave it out, or set shape: positions"
+            yield Problem((("positions",), ("shape",)), text)
         far = max((abs(v) for position in self.positions or () for v in position), default=0.0)
         if far > FARTHEST:
-            said = f"{far:g} is no place in an array, {FARTHEST:g} is the farthest; correct it"
-            yield Problem((("positions",),), said)
+            text = f"{far:g} is no place in an array, {FARTHEST:g} is the farthest; correct it"
+            yield Problem((("positions",),), text)
         if self.count(True) > MAX_ELEMENTS:
-            said = f"{self.count(True)} elements are more than {MAX_ELEMENTS}; take fewer"
-            yield Problem((("columns",), ("rows",)), said)
+            text = f"{self.count(True)} elements are more than {MAX_ELEMENTS}; take fewer"
+            yield Problem((("columns",), ("rows",)), text)
 
 
 class Array(Node):
@@ -440,11 +440,11 @@ class Array(Node):
 
     def problems(self) -> Iterator[Problem]:
         if self.pattern_file is not None:
-            said = "is read by isac_rt.load, which was not used; state pattern"
-            yield Problem((("pattern_file",),), said)
+            text = "is read by isac_rt.load, which was not used; state pattern"
+            yield Problem((("pattern_file",),), text)
         elif (self.pattern is None) == (self.element_pattern == "table"):
-            said = "goes with element_pattern table, which needs it or pattern_file"
-            yield Problem((("pattern",), ("element_pattern",)), said)
+            text = "goes with element_pattern table, which needs it or pattern_file"
+            yield Problem((("pattern",), ("element_pattern",)), text)
         excess = self.element_gain_dbi - self.largest_gain_dbi
         if excess > GAIN_ROUNDING_DB:
             yield Problem(

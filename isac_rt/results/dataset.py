@@ -156,12 +156,12 @@ def dataset_of(
     out: dict[str, xr.Variable] = {}
 
     def put(name: str, dims: Sequence[str], values: Any, units: str, meaning: str) -> None:
-        said, values = {"units": units, "long_name": meaning}, np.asarray(values)
+        attrs, values = {"units": units, "long_name": meaning}, np.asarray(values)
         # another look at the array would load dask, which takes as long as three figures
         if [name] == list(dims):
-            out[name] = xr.IndexVariable(name, pd.Index(values, dtype=values.dtype), said)
+            out[name] = xr.IndexVariable(name, pd.Index(values, dtype=values.dtype), attrs)
         else:
-            out[name] = xr.Variable(tuple(dims), values, said, fastpath=True)
+            out[name] = xr.Variable(tuple(dims), values, attrs, fastpath=True)
 
     for name, words, meaning in (
         ("observer", labels, "link, by its receiver where that is enough"),

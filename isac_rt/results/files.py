@@ -95,18 +95,18 @@ def write_dataset(dataset: xr.Dataset, file: Path) -> None:
         whole.dimensions = dict(dataset.sizes)
         whole.attrs.update(dataset.attrs)
         for name, variable in dataset.variables.items():
-            values, said = np.asarray(variable.values), dict(variable.attrs)
+            values, attrs = np.asarray(variable.values), dict(variable.attrs)
             words = values.dtype.kind in "OU"
             packed = {} if words or not values.size or not values.ndim else COMPRESSION
             if values.dtype == bool:
-                values, said["dtype"] = values.astype(np.int8), "bool"
+                values, attrs["dtype"] = values.astype(np.int8), "bool"
             located = [str(other) for other, dims in auxiliary.items() if dims <= {*variable.dims}]
             if located and name not in dataset.coords:
-                said["coordinates"] = " ".join(located)
+                attrs["coordinates"] = " ".join(located)
             fill = np.nan if values.dtype.kind == "f" else None
             values = values.astype(h5py.string_dtype()) if words else values
             of = {"dtype": values.dtype, "data": values, "fillvalue": fill, **packed}
-            whole.create_variable(str(name), variable.dims, **of).attrs.update(said)
+            whole.create_variable(str(name), variable.dims, **of).attrs.update(attrs)
     write_whole(file, made.getvalue())
 
 

@@ -33,11 +33,11 @@ def versions_in_use() -> dict[str, str]:
 
 @lru_cache
 def _warn_of(name: str, version: str) -> None:
-    said = (
+    message = (
         f"{name} {version}: another copy than the installed one is loaded; look at PYTHONPATH, "
         "and start anew after an upgrade"
     )
-    warnings.warn(ScenarioWarning(said), stacklevel=2)
+    warnings.warn(ScenarioWarning(message), stacklevel=2)
 
 
 @lru_cache(maxsize=1)

@@ -53,8 +53,8 @@ def _doubts_of_keys(scenario: Scenario) -> Iterator[Problem]:
     for one in scenario.by_chirp():
         for (a, first), (b, second) in combinations(one.first_blocks().items(), 2):
             if abs(first - second) < one.radio.groups:
-                said = f"{b} and {a} send in the same resource blocks; shall they collide?"
-                yield Problem((("swarm", b, "resource_block"),), said)
+                message = f"{b} and {a} send in the same resource blocks; shall they collide?"
+                yield Problem((("swarm", b, "resource_block"),), message)
     for key, (low, high, unit) in PLAUSIBLE.items():
         value: object = scenario
         for name in key:
@@ -100,7 +100,7 @@ def _doubts_of_flights(scenario: Scenario) -> Iterator[Problem]:
             for i, w in enumerate(uav.waypoints):
                 distance = math.dist(w.position_m, centre)
                 distances["swarm", name, "waypoints", i, "position_m"] = distance
-        for values, most, said, units in (
+        for values, most, message, units in (
             (speeds, FASTEST_MPS, "flies at {:.4g} m/s", "metres and seconds"),
             (distances, FARTHEST_M, f"lies {{:.4g}} m from {what}", "metres"),
         ):
@@ -111,7 +111,7 @@ def _doubts_of_flights(scenario: Scenario) -> Iterator[Problem]:
             count = f", and above it {len(exceeding)} times" if len(exceeding) > 1 else ""
             yield Problem(
                 (worst,),
-                f"{said.format(values[worst])}, more than {most:g}{count}; is it in {units}?",
+                f"{message.format(values[worst])}, more than {most:g}{count}; is it in {units}?",
             )
 
 

@@ -93,8 +93,8 @@ def _missing_files(tree: Mapping[str, Any], folder: Path) -> Iterator[Problem]:
             here = above.get(node)
             name = here.get(key) if isinstance(here, dict) else None
             if isinstance(name, str) and not os.path.isfile(folder / name):
-                said = f"no such file in {folder}; {make.format(folder / name)}"
-                yield Problem(((*at, node, key),), said)
+                message = f"no such file in {folder}; {make.format(folder / name)}"
+                yield Problem(((*at, node, key),), message)
 
 
 def folded_tree(scenario: Scenario, keys: Iterable[str]) -> dict[str, Any]:

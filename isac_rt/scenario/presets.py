@@ -74,12 +74,12 @@ class ReceiverSet(Node):
 def with_preset(stated: dict[str, Any], named: Any, own: dict[str, Any]) -> dict[str, Any]:
     """Return a file's settings of a set of receivers, completed by the preset `named` and by `own`
     settings. Malformed parts stay as they are, for the validation."""
-    said = PRESETS.get(named, {}) if isinstance(named, str) else {}
+    preset = PRESETS.get(named, {}) if isinstance(named, str) else {}
     out = dict(stated)
     for key in ("receivers", "tracking"):
         mine = stated.get(key, {})
         if isinstance(mine, dict):
-            parts = [p for p in (own.get(key), said.get(key)) if isinstance(p, dict)]
+            parts = [p for p in (own.get(key), preset.get(key)) if isinstance(p, dict)]
             filled = {k: v for part in parts for k, v in part.items()} | mine
             out[key] = filled if key == "tracking" else _without_idle(filled, mine)
     return out

@@ -162,10 +162,10 @@ def with_sensor(stated: dict[str, Any]) -> dict[str, Any]:
     return completed(out, SENSORS[name.lower()])
 
 
-def completed(stated: dict[str, Any], said: dict[str, dict[str, Any]]) -> dict[str, Any]:
+def completed(stated: dict[str, Any], defaults: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Return settings with what a sensor says under the keys that are stated."""
     out = dict(stated)
-    for key, values in said.items():
+    for key, values in defaults.items():
         own = stated.get(key, {})
         if isinstance(own, dict):
             out[key] = {**values, **own}

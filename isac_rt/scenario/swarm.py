@@ -47,8 +47,8 @@ class Uav(settings.Uav):
         yield from super().problems()
         for key in HARDWARE:
             if getattr(self, key) is not None and self.role == "target":
-                said = "has no meaning for a target, which neither sends nor receives; remove it"
-                yield Problem(((key,), ("role",)), said)
+                message = "has no meaning for a target, which neither sends nor receives; remove it"
+                yield Problem(((key,), ("role",)), message)
 
 
 def unfolded(swarm: dict[Any, Any]) -> dict[Any, Any]:

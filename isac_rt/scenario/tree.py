@@ -294,11 +294,11 @@ class Scenario(Node):
                 "antenna needs the same number of slots",
             )
         if self.radio.groups > self.num_tx:
-            said = (
+            message = (
                 f"{self.radio.groups} groups are more than {antennas}; use fewer groups or more "
                 "transmit antennas"
             )
-            yield Problem((("radio", "groups"), *sizes), said)
+            yield Problem((("radio", "groups"), *sizes), message)
 
     def _interval_problems(self) -> Iterator[Problem]:
         if self.frame_interval_s is not None and self.frame_interval_s < self.frame_duration_s * (
@@ -345,24 +345,24 @@ class Scenario(Node):
             return
         for name, uav in self.swarm.items():
             if uav.role == "passive":
-                said = "mode fmcw has no passive terminals; make it a target, or active"
-                yield Problem((("swarm", name, "role"), ("radio", "mode")), said)
+                message = "mode fmcw has no passive terminals; make it a target, or active"
+                yield Problem((("swarm", name, "role"), ("radio", "mode")), message)
 
     def _fmcw_access_problems(self) -> Iterator[Problem]:
         if self.radio.mode == "isac":
             return
         for key in ("establish", "feedback"):
             if getattr(self.access, key):
-                said = "mode fmcw has no links between terminals; leave it out"
-                yield Problem((("access", key), ("radio", "mode")), said)
+                message = "mode fmcw has no links between terminals; leave it out"
+                yield Problem((("access", key), ("radio", "mode")), message)
 
     def _fmcw_array_problems(self) -> Iterator[Problem]:
         r = self.radio
         if r.mode == "isac":
             return
         if self.array.fall_back:
-            said = "mode fmcw has its own order of antennas (radio.scheme); leave it out"
-            yield Problem((("array", "fall_back"), ("radio", "mode")), said)
+            message = "mode fmcw has its own order of antennas (radio.scheme); leave it out"
+            yield Problem((("array", "fall_back"), ("radio", "mode")), message)
         if r.scheme == "simo" and self.num_tx != 1:
             yield Problem(
                 (("radio", "scheme"), ("array", "tx_x"), ("array", "tx_z")),
@@ -421,11 +421,11 @@ class Scenario(Node):
         for i, change in enumerate(self.role_changes):
             key = ("role_changes", i)
             if change.frame <= last or change.frame >= self.frames:
-                said = (
+                message = (
                     f"must be after {last} (the change before it) and below the number of "
                     f"frames, {self.frames}"
                 )
-                yield Problem(((*key, "frame"), ("frames",)), said)
+                yield Problem(((*key, "frame"), ("frames",)), message)
             last = max(last, change.frame)
             for end, name, role in (
                 ("from_uav", change.from_uav, "active"),
@@ -440,23 +440,23 @@ class Scenario(Node):
 
     def _access_problems(self) -> Iterator[Problem]:
         if self.access.synchronisation == "two_round" and not self.access.establish:
-            said = (
+            message = (
                 "two_round measures clocks in the stages before the data; set access.establish: "
                 "true, or take external or none"
             )
-            yield Problem((("access", "synchronisation"), ("access", "establish")), said)
+            yield Problem((("access", "synchronisation"), ("access", "establish")), message)
         if self.access.synchronisation == "none" and self.access.feedback:
-            said = (
+            message = (
                 "feedback compares ranges of two terminals, which need the same clock; leave it "
                 "out, or take external or two_round"
             )
-            yield Problem((("access", "feedback"), ("access", "synchronisation")), said)
+            yield Problem((("access", "feedback"), ("access", "synchronisation")), message)
         if self.access.establish and self.role_changes:
-            said = (
+            message = (
                 "the stages are gone through once, before the first frame; a change of roles "
                 "needs them again; leave one of the two out"
             )
-            yield Problem((("access", "establish"), ("role_changes",)), said)
+            yield Problem((("access", "establish"), ("role_changes",)), message)
 
     def _stream_problems(self) -> Iterator[Problem]:
         ever_passive = {name for name, uav in self.swarm.items() if uav.role == "passive"}
@@ -473,26 +473,26 @@ class Scenario(Node):
                 or len(set(groups)) < len(groups)
                 or max(groups, default=0) >= self.radio.groups
             ):
-                said = (
+                message = (
                     f"needs one group or more of 0 to {self.radio.groups - 1} (radio.groups = "
                     f"{self.radio.groups}), each once"
                 )
-                yield Problem((stream, ("radio", "groups")), said)
+                yield Problem((stream, ("radio", "groups")), message)
 
     def _own_chirp_problems(self) -> Iterator[Problem]:
         """List what terminals cannot have of a chirp of their own."""
         for name, uav in self.swarm.items():
             for key in ("sensor", "radio"):
                 if getattr(uav, key) is not None and self.radio.mode == "isac":
-                    said = "terminals that send data share the chirp; leave it out, or set "
+                    message = "terminals that send data share the chirp; leave it out, or set "
                     keys = ("swarm", name, key), ("radio", "mode")
-                    yield Problem(keys, f"{said}radio.mode: fmcw for all")
+                    yield Problem(keys, f"{message}radio.mode: fmcw for all")
                     break
         modes = {name: uav.radio.mode for name, uav in self.swarm.items() if uav.radio is not None}
         for name, mode in modes.items():
             if self.radio.mode == "fmcw" != mode:
-                said = "is isac, and radio.mode of all terminals is fmcw; leave it out"
-                yield Problem((("swarm", name, "radio", "mode"), ("radio", "mode")), said)
+                message = "is isac, and radio.mode of all terminals is fmcw; leave it out"
+                yield Problem((("swarm", name, "radio", "mode"), ("radio", "mode")), message)
         if "isac" in modes.values():
             return
         for one in self.by_chirp():
@@ -551,40 +551,40 @@ class Scenario(Node):
         for name, uav in self.swarm.items():
             array = uav.array or self.array
             if array.num_tx != self.num_tx and uav.radio is None:
-                said = (
+                message = (
                     f"{array.num_tx} transmit elements, and array has {self.num_tx}: all terminals "
                     "share the order in which these take turns; state as many"
                 )
-                yield Problem((("swarm", name, "array"), ("array",)), said)
+                yield Problem((("swarm", name, "array"), ("array",)), message)
             for key in ("schedule", "fall_back"):
                 if getattr(array, key) != getattr(self.array, key):
-                    said = f"all terminals share array.{key}; leave it out"
-                    yield Problem((("swarm", name, "array", key), ("array", key)), said)
+                    message = f"all terminals share array.{key}; leave it out"
+                    yield Problem((("swarm", name, "array", key), ("array", key)), message)
             if uav.noise is not None and uav.noise.model != self.noise.model:
-                said = f"all terminals share noise.model, {self.noise.model}; leave it out"
-                yield Problem((("swarm", name, "noise", "model"), ("noise", "model")), said)
+                message = f"all terminals share noise.model, {self.noise.model}; leave it out"
+                yield Problem((("swarm", name, "noise", "model"), ("noise", "model")), message)
 
     def _self_calibration_problems(self) -> Iterator[Problem]:
         """Schedules by which the channels of an echo cannot be told in one frame."""
         if self.radio.groups == self.num_tx and self.radio.bands(self.num_tx) == 1:
             return
-        said = (
+        message = (
             f"needs as many groups as the {self.num_tx} transmit antennas, one of which sends at a "
             f"time, and there are {self.radio.groups}; set it to none, or change radio.groups"
         )
         if self.radio.mode == "fmcw":
-            said = (
+            message = (
                 f"needs one transmit antenna in mode fmcw, and there are {self.num_tx}; set it to "
                 "none, or send from one antenna"
             )
         for at, receivers in self._all_receivers().items():
             if receivers.self_calibration != "none":
-                yield Problem(((*at, "self_calibration"), ("radio", "groups")), said)
+                yield Problem(((*at, "self_calibration"), ("radio", "groups")), message)
 
     def _calibration_problems(self) -> Iterator[Problem]:
         if self.radio.calibration is not None and self.radio.bands(self.num_tx) > 1:
-            said = "gains of antennas that send at once cannot be told in the samples; take tdm"
-            yield Problem((("radio", "scheme"), ("radio", "calibration")), said)
+            message = "gains of antennas that send at once cannot be told in the samples; take tdm"
+            yield Problem((("radio", "scheme"), ("radio", "calibration")), message)
 
     def _front_end_problems(self) -> Iterator[Problem]:
         common: Key = ("radio", "front_end")
@@ -600,28 +600,28 @@ class Scenario(Node):
             yield from self._element_problems((*key, "receive"), one.receive, at, array.num_rx)
             sent = one.transmit_response
             if sent.differs and self.radio.bands(self.num_tx) > 1:
-                said = (
+                message = (
                     "antennas that send at once have one response over the chirp here; state it by "
                     "a table of all and set its slope_std_db and slope_std_deg to "
                     "0, or take another scheme"
                 )
-                yield Problem(((*key, "transmit_response"), ("radio", "scheme")), said)
+                yield Problem(((*key, "transmit_response"), ("radio", "scheme")), message)
             powers: list[Key] = [("converter", name) for name in one.converter.powers()]
             powers += [("saturation_dbm",)] if one.saturation_dbm is not None else []
             if powers and self.noise.model == "snr":
-                said = (
+                message = (
                     "states a power in dBm, which noise.model snr does not know; take link_budget, "
                     "or leave it out"
                 )
-                yield Problem(((*key, *powers[0]), ("noise", "model")), said)
+                yield Problem(((*key, *powers[0]), ("noise", "model")), message)
 
     @staticmethod
     def _element_problems(key: Key, elements: Elements, array: Key, size: int) -> Iterator[Problem]:
         for name, count in elements.counts():
             if count != size:
                 of = f"{size} {key[-1]} elements of {dotted(array)}"
-                said = f"{count} values for {of}; state one of each"
-                yield Problem(((*key, name), array), said)
+                message = f"{count} values for {of}; state one of each"
+                yield Problem(((*key, name), array), message)
                 return
 
     def first_blocks(self) -> dict[str, int]:
@@ -673,8 +673,8 @@ class Scenario(Node):
 
     def _weather_problems(self) -> Iterator[Problem]:
         if self.weather is not None and not 1e9 <= self.radio.carrier_hz <= 1e12:
-            said = "is known from 1 to 1000 GHz; leave it out, or give the carrier in hertz"
-            yield Problem((("weather",), ("radio", "carrier_hz")), said)
+            message = "is known from 1 to 1000 GHz; leave it out, or give the carrier in hertz"
+            yield Problem((("weather",), ("radio", "carrier_hz")), message)
 
     def _detector_problems(self) -> Iterator[Problem]:
         for at, one in self._all_receivers().items():
@@ -694,22 +694,22 @@ class Scenario(Node):
         for at, one in sets.items():
             if one.needs_mesh and self.city is None:
                 key = (*at, "initiation")
-                said = f"{one.initiation} needs a city; add one or set {dotted(key)} to all"
-                yield Problem((key, ("city",)), said)
+                message = f"{one.initiation} needs a city; add one or set {dotted(key)} to all"
+                yield Problem((key, ("city",)), message)
 
     def _sensor_problems(self) -> Iterator[Problem]:
         stated: dict[Key, str | None] = {("sensor",): self.sensor}
         stated |= {("swarm", name, "sensor"): uav.sensor for name, uav in self.swarm.items()}
         for key, sensor in stated.items():
             if sensor is not None and sensor not in SENSORS:
-                said = "is read by isac_rt.load, which was not used; state radio and array"
-                yield Problem((key,), said)
+                message = "is read by isac_rt.load, which was not used; state radio and array"
+                yield Problem((key,), message)
 
     def _set_problems(self) -> Iterator[Problem]:
         for name, one in self.compare.items():
             if name == OWN:
-                said = "is the name of the scenario's own receivers; choose another"
-                yield Problem((("compare", name),), said)
+                message = "is the name of the scenario's own receivers; choose another"
+                yield Problem((("compare", name),), message)
             for key in ("active_every_frames",):
                 own, other = getattr(self.receivers, key), getattr(one.receivers, key)
                 if own != other:
@@ -793,9 +793,9 @@ def json_schema() -> dict[str, Any]:
     nodes |= {f"{node.__module__}.{node.__name__}".replace(".", "__"): node for node in every}
     for name, entry in {"Scenario": tree, **tree["$defs"]}.items():
         entry["description"] = " ".join(entry["description"].split())
-        said = _docstrings(nodes[name])
+        docstrings = _docstrings(nodes[name])
         for key, own in entry.get("properties", {}).items():
-            own["description"] = " ".join(said[key].split())
+            own["description"] = " ".join(docstrings[key].split())
             entry["properties"][key] = dict(sorted(own.items()))
     return tree
 

@@ -119,14 +119,14 @@ def _check_times(swarm: Swarm, timetable: Timetable) -> None:
         if uav.waypoints is None:
             continue
         first, last = uav.waypoints[0].time_s, uav.waypoints[-1].time_s
-        said = (
+        message = (
             f"swarm.{name}: its waypoints are from {first:g} to {last:g} s, the run is from "
             f"{begin:.3g} to {end:.3g} s"
         )
         if first > end or last < begin:
-            raise ScenarioError(f"{said}; count time_s from the start of the run")
+            raise ScenarioError(f"{message}; count time_s from the start of the run")
         if max(first - begin, end - last) > timetable.interval:
-            _warn(f"{said}; it flies straight on before and after them")
+            _warn(f"{message}; it flies straight on before and after them")
 
 
 def check_passage(swarm: Swarm, timetable: Timetable, city: CityMesh) -> None:
@@ -376,8 +376,8 @@ def warn_of_unseen(seen: Coverage) -> None:
         )
 
 
-def _warn(said: str) -> None:
-    warnings.warn(said, ScenarioWarning, stacklevel=4)
+def _warn(message: str) -> None:
+    warnings.warn(message, ScenarioWarning, stacklevel=4)
 
 
 def _causes(row: Outside) -> str:

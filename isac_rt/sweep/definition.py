@@ -143,11 +143,11 @@ class Sweep(Free):
             yield Problem((("axes",),), "has no axis; for a single scenario use isac-rt run")
         for name in self.axes:
             if name in OWN_DIMENSIONS or not name.isidentifier():
-                said = (
+                message = (
                     f"an axis's name must be a word other than {', '.join(OWN_DIMENSIONS)}; "
                     "rename it"
                 )
-                yield Problem((("axes", name),), said)
+                yield Problem((("axes", name),), message)
         every: list[tuple[Key, str]] = [(("set", key), key) for key in self.set]
         every += [
             (("axes", name), key) for name, axis in self.axes.items() for key in sorted(axis.keys)
@@ -391,11 +391,11 @@ def load_sweep(path: Path | str, max_points: int = MAX_POINTS) -> Plan:
         factors = " x ".join(
             f"{n} {name}" for name, n in zip([*sweep.axes, "repetitions"], sweep.shape, strict=True)
         )
-        said = (
+        message = (
             f"{factors} are {sweep.num_points:,} points, more than {max_points:,}; shorten the "
             "axes or raise --max-points"
         )
-        raise refuse(("axes",), said)
+        raise refuse(("axes",), message)
     file = path.parent / sweep.scenario
     try:
         base = load(file, options(sweep.set))

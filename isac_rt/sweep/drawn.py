@@ -125,8 +125,8 @@ class Place(Free):
         if not self.num_cells:
             yield Problem((("cell_m",),), "no whole cell fits into the ground; make it smaller")
         elif self.num_cells > MOST_CELLS:
-            said = f"the ground has more than {MOST_CELLS} cells; make them larger"
-            yield Problem((("cell_m",),), said)
+            message = f"the ground has more than {MOST_CELLS} cells; make them larger"
+            yield Problem((("cell_m",),), message)
 
     @property
     def sides(self) -> tuple[int, int]:
@@ -187,11 +187,11 @@ class DataSet(Free):
         if not self.splits:
             yield Problem((("splits",),), "has no split; give it one")
         elif self.place and self.place.num_cells < len(self.splits):
-            said = (
+            message = (
                 f"the ground has {self.place.num_cells} cells for {len(self.splits)} splits, "
                 "which share none; make cell_m smaller or the ground larger"
             )
-            yield Problem((("place", "cell_m"), ("splits",)), said)
+            yield Problem((("place", "cell_m"), ("splits",)), message)
 
 
 @dataclass(frozen=True)
@@ -386,8 +386,8 @@ def load_dataset(path: Path | str) -> DataPlan:
     try:
         _ = plan.scenes
     except (AttributeError, KeyError, IndexError, TypeError, ValueError) as problem:
-        said = f"the scenario has no such key ({problem}); check the keys"
-        raise refuse(("draw",), said) from None
+        message = f"the scenario has no such key ({problem}); check the keys"
+        raise refuse(("draw",), message) from None
     except ScenarioError as problem:
         raise refuse(("place",) if data.place else ("draw",), str(problem)) from None
     return plan

@@ -36,8 +36,8 @@ def range_doppler(ax: Axes, dataset: xr.Dataset, snapshot: int, observer: int) -
     r, v = r[np.isfinite(r)], v[np.isfinite(v)]
     draw_map(ax, v, r, level, (0.0, _SHOWN_DB), "power over median [dB]")
     if not level.any():
-        said = "no map: the delays of the data\nwere not known"
-        ax.text(0.5, 0.5, said, color="white", ha="center", transform=ax.transAxes)
+        message = "no map: the delays of the data\nwere not known"
+        ax.text(0.5, 0.5, message, color="white", ha="center", transform=ax.transAxes)
     frame, number = moment(dataset, snapshot)
     mine = (dataset.det_frame.values == frame) & (dataset.det_observer.values == observer)
     kind = dataset.det_kind.values

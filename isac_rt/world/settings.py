@@ -248,8 +248,8 @@ class Rcs(Node):
         if self.file is not None:
             yield Problem((("file",),), "is read by isac_rt.load, which was not used; state table")
         elif (self.table is None) == (self.model == "table"):
-            said = "goes with model table, and model table with it or with file"
-            yield Problem((("table",), ("model",)), said)
+            text = "goes with model table, and model table with it or with file"
+            yield Problem((("table",), ("model",)), text)
 
 
 class Rotors(Node):
@@ -396,27 +396,27 @@ class Uav(Node):
 
     def problems(self) -> Iterator[Problem]:
         if self.resource_block is not None and self.role != "active":
-            said = (
+            text = (
                 f"has no meaning for a UAV that is {self.role} at the start (who takes over the "
                 "role takes over its blocks); remove it"
             )
-            yield Problem((("resource_block",), ("role",)), said)
+            yield Problem((("resource_block",), ("role",)), text)
         if self.flight is not None:
-            said = "is read by isac_rt.load, which was not used; state waypoints"
-            yield Problem((("flight",),), said)
+            text = "is read by isac_rt.load, which was not used; state waypoints"
+            yield Problem((("flight",),), text)
         if self.formation is not None:
-            said = "is unfolded in the swarm of a scenario; state UAVs one by one here"
-            yield Problem((("formation",),), said)
+            text = "is unfolded in the swarm of a scenario; state UAVs one by one here"
+            yield Problem((("formation",),), text)
         turned = [w.attitude_deg is not None for w in self.waypoints or ()]
         if any(turned) and not all(turned):
-            said = "some have attitude_deg and some have not; state it at all or at none"
-            yield Problem((("waypoints",),), said)
+            text = "some have attitude_deg and some have not; state it at all or at none"
+            yield Problem((("waypoints",),), text)
         if any(turned) and self.boresight != "velocity":
-            said = "the waypoints' attitude_deg says where the UAV looks; leave one of the two out"
-            yield Problem((("boresight",), ("waypoints",)), said)
+            text = "the waypoints' attitude_deg says where the UAV looks; leave one of the two out"
+            yield Problem((("boresight",), ("waypoints",)), text)
         if self.rotors is not None and self.rcs.model == "relative":
-            said = "have a cross-section in square metres; give the UAV another rcs.model"
-            yield Problem((("rotors",), ("rcs", "model")), said)
+            text = "have a cross-section in square metres; give the UAV another rcs.model"
+            yield Problem((("rotors",), ("rcs", "model")), text)
         if (speed := math.hypot(*self.velocity_mps)) > MAX_SPEED_MPS:
             yield Problem((("velocity_mps",),), _too_fast(speed))
         if self.waypoints is None and self.position_m is None:

@@ -397,11 +397,11 @@ def mesh_file(
             f"it has {', '.join(sorted(seen)) or 'no names'}"
         )
     if unknown:
-        said = f"names that are no known material became {city.material}"
-        notes.append(f"{said}: {_listed(unknown, 'faces')}")
+        text = f"names that are no known material became {city.material}"
+        notes.append(f"{text}: {_listed(unknown, 'faces')}")
     if guessed:
-        said = "names that hold that of a known material are taken for it"
-        notes.append(f"{said}: {_listed(guessed, 'pieces')}")
+        text = "names that hold that of a known material are taken for it"
+        notes.append(f"{text}: {_listed(guessed, 'pieces')}")
     if gltf and not y_up:
         notes.append("glTF is y-up by its standard, and city.up_axis is z")
     return found, notes, mesh_georeference(city, path), city.up_axis == "auto" and not gltf
