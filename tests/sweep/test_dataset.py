@@ -63,7 +63,7 @@ def plan_of(folder: Path, text: str):
 def test_an_earlier_key_is_refused_with_its_name_today(folder):
     """Planted bug: `rotate` without its entry among the removed keys."""
     text = SET.replace("cell_m: 18", "cell_m: 18, turn: false")
-    with pytest.raises(ScenarioError, match="place.turn.*rotate"):
+    with pytest.raises(ScenarioError, match=r"place\.turn.*rotate"):
         plan_of(folder, text)
 
 
