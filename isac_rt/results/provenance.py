@@ -78,6 +78,7 @@ UNSEEN_BY_PATHS = (
     "cooperation",
     "compare",
     "weather",
+    "emitters",
 )
 """Parts of a scenario on which its paths do not depend: runs that differ in nothing else share
 them. What they say of the links and of the city's reach is in the key of stored paths besides."""

@@ -31,6 +31,7 @@ from isac_rt.frame.front_end import Elements, FrontEnd
 from isac_rt.frame.settings import Array, Modulation, Noise, RoleChange
 from isac_rt.propagation.settings import Clutter, Propagation, Weather
 from isac_rt.receive.settings import Receivers
+from isac_rt.scenario.emitters import Emitter
 from isac_rt.scenario.presets import Preset, ReceiverSet, with_preset
 from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.sensors import SENSORS, BoardFile, Sensor, with_sensor
@@ -100,6 +101,8 @@ class Scenario(Node):
     nothing."""
     weather: Weather | None = None
     """Air and rain on the paths. null, the default: vacuum."""
+    emitters: dict[Name, Emitter] = Field({})
+    """Foreign FMCW radars by name. By default none."""
     noise: Noise = Noise()
     """How strong the receiver's noise is: by a link budget, the default, or by a stated SNR."""
     receiver_preset: Preset | None = None
@@ -252,6 +255,7 @@ class Scenario(Node):
             self._rcs_problems,
             self._clutter_problems,
             self._weather_problems,
+            self._emitter_problems,
             self._detector_problems,
             self._initiation_problems,
             self._calibration_problems,
@@ -675,6 +679,15 @@ class Scenario(Node):
         if self.weather is not None and not 1e9 <= self.radio.carrier_hz <= 1e12:
             message = "is known from 1 to 1000 GHz; leave it out, or give the carrier in hertz"
             yield Problem((("weather",), ("radio", "carrier_hz")), message)
+
+    def _emitter_problems(self) -> Iterator[Problem]:
+        for name in self.emitters:
+            if name in self.swarm:
+                said = "is the name of a UAV of the swarm; choose another"
+                yield Problem((("emitters", name), ("swarm", name)), said)
+        if self.emitters and self.noise.model == "snr":
+            said = "send a power in dBm, which noise.model snr does not know; take link_budget"
+            yield Problem((("emitters",), ("noise", "model")), said)
 
     def _detector_problems(self) -> Iterator[Problem]:
         for at, one in self._all_receivers().items():

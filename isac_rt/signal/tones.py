@@ -127,8 +127,8 @@ def tones_of(
         row[near] = rows + np.arange(near.size)
         rows += near.size
         # far-field or spherical delays of the elements; lines of sight jointly for both arrays
-        tx_delay = _element_delay(tx, s.departure, s.tx_radius)
-        rx_delay = _element_delay(rx, s.arrival, s.rx_radius)
+        tx_delay = element_delay(tx, s.departure, s.tx_radius)
+        rx_delay = element_delay(rx, s.arrival, s.rx_radius)
         joint = _straight_delay(tx, rx, s.departure[near], s.rx_radius[near])
         # from the epoch of the paths to mid-frame
         later = middle - s.epoch
@@ -158,7 +158,7 @@ def tones_of(
     return Tones(**{name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
 
 
-def _element_delay(elements: np.ndarray, direction: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def element_delay(elements: np.ndarray, direction: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Return (|R u - r| - R)/c, or -r.u/c for infinite R: (K, L) [s]. With x = r^2 - 2 R r.u this
     is x / (sqrt(R^2 + x) + R), without cancellation."""
     along = direction @ elements.T
@@ -181,7 +181,7 @@ def _straight_delay(
     tx: np.ndarray, rx: np.ndarray, direction: np.ndarray, length: np.ndarray
 ) -> np.ndarray:
     """Return (|L d + r_rx - r_tx| - L)/c of straight paths (K, L_tx, L_rx) [s], written as in
-    `_element_delay`."""
+    `element_delay`."""
     offset = rx[None, :] - tx[:, None]
     along = np.einsum("trx,kx->ktr", offset, direction)
     change = 2 * length[:, None, None] * along + (offset**2).sum(2)

@@ -146,7 +146,12 @@ def _items(setup: Setup, frames: Sequence[int]) -> list[Item]:
     if setup.moving_centres is not None:
         items += [Item(**row) for row in setup.moving_centres.report()]
     items += [] if setup.has_ideal_hardware else _hardware_items(last)
-    return items + _self_calibration_items(setup, last) + _weather_items(setup)
+    return (
+        items
+        + _self_calibration_items(setup, last)
+        + _weather_items(setup)
+        + _emitter_items(setup, last)
+    )
 
 
 def _next_slot(setup: Setup) -> float:
@@ -209,6 +214,18 @@ def _weather_items(s: Setup) -> list[Item]:
         return []
     rows = extension("weather_plan")(s.scenario.weather, s.waveform, link_budgets(s))
     return [Item(**row) for row in rows]
+
+
+def _emitter_items(s: Setup, frame: Frame) -> list[Item]:
+    """Return an item for each link that receives emitters."""
+    rows = {}
+    for link in frame.paths:
+        if link.rx in frame.foreign:
+            receiver = ReceiveArray(frame.poses[link.rx], s.arrays.of(link.rx))
+            reference = Reference(s.timetable.start_time(frame.number, link.tx))
+            about = frame.foreign[link.rx], receiver, reference, frame.noise_power(link)
+            rows[link] = extension("emitters_plan")(s.waveform, *about)
+    return [Item("foreign radars", link=str(link), **row) for link, row in rows.items()]
 
 
 def missed_per_frame(setup: Setup, frames: Sequence[int]) -> float:

@@ -102,6 +102,9 @@ class Frame:
     uses: Mapping[Link, Use]
     dropped: int
     _setup: Setup = field(repr=False)
+    foreign: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    """What arrives of emitters at each receiver
+    (`isac_rt.extensions.street.emitters.Arrival`)."""
     _by_chirp: Mapping[str, Frame] = field(default_factory=dict, repr=False)
     """The frame as the radars of each chirp have it, by transmitter; empty where all share one."""
 
@@ -154,6 +157,10 @@ class Frame:
         lasting = sum(len(self.paths[Link(sent.name, link.rx)]) for sent, _ in arriving)
         method = s.plan.synthesis(lasting, noise.power)
         received = self._listening(link)
+        if link.rx in self.foreign:
+            method = extension("with_foreign")(
+                method, self.foreign[link.rx], *received, noise.power
+            )
         if ends is None and not s.has_ideal_hardware:
             ends = self.ends(link)
         if ends is not None and not ends.ideal:
@@ -309,6 +316,13 @@ class Setup:
         return make(self.swarm, sections, self.waveform, self.arrays, self.scenario.seed)
 
     @cached_property
+    def emitters(self) -> Any:
+        """Foreign radars (`isac_rt.extensions.street.emitters.Emitters`); None without."""
+        if not self.scenario.emitters:
+            return None
+        return extension("emitters")(self.scenario, self.city, self.waveform)
+
+    @cached_property
     def calibration(self) -> Any:
         """Return the calibration of the terminals' boards that `radio.calibration` names.
 
@@ -409,7 +423,20 @@ class Setup:
             {link: use for link, (_, use) in planned.items()},
             dropped,
             self,
+            self._foreign(number, poses, traced),
         )
+
+    def _foreign(
+        self, number: int, poses: dict[str, Pose], links: Iterable[Link]
+    ) -> Mapping[str, Any]:
+        """Trace what arrives of emitters at the receivers of a frame."""
+        if self.emitters is None:
+            return {}
+        receivers = dict.fromkeys(link.rx for link in links)
+        found: Mapping[str, Any] = self.emitters.arrivals(
+            poses, self.timetable.epoch(number), list(receivers)
+        )
+        return found
 
     def find(self, frame: int) -> tuple[dict[str, Pose], dict[Link, PathSet]]:
         """Return the poses and all paths of a frame, weak ones included."""
@@ -431,7 +458,7 @@ class Setup:
             _union([one.uses for one in frames]),
             sum(one.dropped for one in frames),
             self,
-            {name: one for one in frames for name in one.sent},
+            _by_chirp={name: one for one in frames for name in one.sent},
         )
 
     def _traced(self, frame: int) -> tuple[dict[str, Pose], Traced]:
