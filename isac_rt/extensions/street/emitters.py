@@ -108,7 +108,7 @@ class Train:
 
 @dataclass(frozen=True)
 class Arrival:
-    """What arrives of one emitter at one receiver in one frame.
+    """Signal of one emitter at one receiver in one frame.
 
     Attributes
     ----------
