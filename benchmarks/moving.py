@@ -43,6 +43,7 @@ class Job:
         section = 10 ** (uav.rcs.value_dbsm / 10)
         speed = float(np.linalg.norm(self.frame.poses["person"].velocity))
         self.walker = walker_of(HIP_M / 0.53, speed, section, 0.4)
+        self.amplitudes = self.walker.amplitudes(np.zeros(3), np.zeros(3))
         centres = [("person", self.walker)]
         self.moving = MovingCentres(s.swarm, s.reference.sections, s.waveform, s.arrays, centres)
 
@@ -78,9 +79,7 @@ class Job:
                 back = np.linalg.norm(points - element, axis=2)
                 tau = (there + back) / SPEED_OF_LIGHT
                 tones = np.exp(2j * np.pi * w.phase(tau, w.fast_time[:, None]))
-                out[0, r, c] = np.conj(gain) * (tones * share * self.walker.amplitudes()).sum(
-                    axis=1
-                )
+                out[0, r, c] = np.conj(gain) * (tones * share * self.amplitudes).sum(axis=1)
         return out
 
 
@@ -116,6 +115,7 @@ def scenario(chirps: int) -> Scenario:
                 "person": {
                     "role": "target",
                     "waypoints": waypoints,
+                    "extent": {"kind": "pedestrian"},
                     "rcs": {"model": "constant", "value_dbsm": -1.37},
                 },
             },
@@ -138,7 +138,7 @@ def rows(quick: bool) -> list[dict[str, Any]]:
     row = {
         "kind": "moving",
         "method": "pedestrian, motion within chirps",
-        "size": len(job.walker.amplitudes()),
+        "size": len(job.amplitudes),
         "unit": "points",
         "error": error,
         "error_of": "relative RMS against all points placed at every sample",

@@ -3,6 +3,9 @@ fluctuation that is smooth in aspect."""
 
 from __future__ import annotations
 
+from functools import reduce
+from typing import NamedTuple
+
 import numpy as np
 from scipy.special import i0
 
@@ -13,16 +16,28 @@ from isac_rt.world.settings import Rcs
 SMALL_MEAN_DBSM = -12.81  # TR 38.901 v19 table 7.9.2.1-1
 TR38901_STD_DB = {"small": 3.74, "large": 2.50}
 """Standard deviation of the random component, by the size of the UAV."""
+
+
+class Lobe(NamedTuple):
+    """One lobe of TR 38.901: azimuth (0 ahead, 90 left; None: about the vertical), its 3 dB width,
+    zenith angle and its width [deg], peak [dBsm] and depth [dB]."""
+
+    azimuth: float | None
+    azimuth_width: float
+    zenith: float
+    zenith_width: float
+    peak: float
+    depth: float
+
+
 LARGE_BISTATIC = (6.05, 1.33)  # k_1, k_2 of eq. 7.9.2-3 for the large UAV
 LARGE_LOBES = (
-    # azimuth of the lobe (None: around the vertical), its 3 dB width, zenith angle, its width, peak
-    # [dBsm], depth [dB]
-    (0.0, 14.19, 90.0, 16.53, 1.02, 7.89),
-    (90.0, 7.13, 90.0, 8.68, 7.43, 14.30),
-    (180.0, 10.09, 90.0, 11.43, 3.99, 10.86),
-    (270.0, 7.13, 90.0, 8.68, 7.43, 14.30),
-    (None, None, 0.0, 4.93, 13.55, 20.42),
-    (None, None, 180.0, 4.93, 13.55, 20.42),
+    Lobe(0.0, 14.19, 90.0, 16.53, 1.02, 7.89),
+    Lobe(90.0, 7.13, 90.0, 8.68, 7.43, 14.30),
+    Lobe(180.0, 10.09, 90.0, 11.43, 3.99, 10.86),
+    Lobe(270.0, 7.13, 90.0, 8.68, 7.43, 14.30),
+    Lobe(None, np.inf, 0.0, 4.93, 13.55, 20.42),
+    Lobe(None, np.inf, 180.0, 4.93, 13.55, 20.42),
 )
 """TR 38.901 v19 table 7.9.2.1-2. Every lobe ends on the same floor, peak - depth = -6.87 dBsm, well
 inside its sector."""
@@ -91,10 +106,19 @@ def excess_db(std_db: np.ndarray) -> np.ndarray:
 
 
 def large_uav_db(bisector: np.ndarray, half_bistatic: np.ndarray) -> np.ndarray:
-    """TR 38.901 eq. 7.9.2-3 for the large UAV [dBsm].
+    """TR 38.901 eq. 7.9.2-3 for the large UAV [dBsm], the largest of its lobes."""
+    each = (lobe_db(lobe, LARGE_BISTATIC, bisector, half_bistatic) for lobe in LARGE_LOBES)
+    return reduce(np.maximum, each)
+
+
+def lobe_db(
+    lobe: Lobe, constants: tuple[float, float], bisector: np.ndarray, half_bistatic: np.ndarray
+) -> np.ndarray:
+    """Cross-section by one lobe, TR 38.901 eq. 7.9.2-3 [dBsm].
 
     Parameters
     ----------
+    constants : k_1 and k_2 of the kind of target
     bisector : (..., 3) unit vectors in the body's frame (X right, Y forward, Z up)
     half_bistatic : (...) half of the bistatic angle [rad]
     """
@@ -102,16 +126,13 @@ def large_uav_db(bisector: np.ndarray, half_bistatic: np.ndarray) -> np.ndarray:
     azimuth = np.degrees(
         np.arctan2(-bisector[..., 0], bisector[..., 1])
     )  # the table's: 0 forward, 90 left
-    k1, k2 = LARGE_BISTATIC
+    k1, k2 = constants
     bistatic = -k1 * np.sin(k2 * half_bistatic) + 5 * np.log10(
         np.maximum(np.cos(half_bistatic), 1e-12)
     )
-    out = np.full(half_bistatic.shape, -np.inf)
-    for centre, width, zenith_centre, zenith_width, peak, depth in LARGE_LOBES:
-        loss = np.minimum(12 * ((zenith - zenith_centre) / zenith_width) ** 2, depth)
-        if centre is not None:
-            off = (azimuth - centre + 180) % 360 - 180
-            loss = loss + np.minimum(12 * (off / width) ** 2, depth)
-        value = np.maximum(peak - np.minimum(loss, depth) + bistatic, peak - depth)
-        out = np.maximum(out, value)
-    return out
+    loss = np.minimum(12 * ((zenith - lobe.zenith) / lobe.zenith_width) ** 2, lobe.depth)
+    if lobe.azimuth is not None:
+        off = (azimuth - lobe.azimuth + 180) % 360 - 180
+        loss = loss + np.minimum(12 * (off / lobe.azimuth_width) ** 2, lobe.depth)
+    value = lobe.peak - np.minimum(loss, lobe.depth) + bistatic
+    return np.maximum(value, lobe.peak - lobe.depth)

@@ -310,7 +310,7 @@ class Setup:
     def moving_centres(self) -> Any:
         """Scattering centres of UAVs beside their echoes, which synthesis alone sees
         (`isac_rt.extensions.street.centres.MovingCentres`); None without."""
-        if not any(uav.rotors for uav in self.swarm.uavs.values()):
+        if not any(uav.rotors or uav.extent for uav in self.swarm.uavs.values()):
             return None
         make, sections = extension("moving_centres"), self.reference.sections
         return make(self.swarm, sections, self.waveform, self.arrays, self.scenario.seed)

@@ -287,6 +287,40 @@ class Rotors(Node):
             )
 
 
+class Centre(Node):
+    """One scattering centre of a target with extent."""
+
+    position_m: Vector
+    """Position from the middle of the UAV: to the right, ahead, up [m]."""
+    value_dbsm: Decibels
+    """Cross-section, the same to all sides [dBsm]."""
+
+
+class Extent(Node):
+    """Scattering centres of a target that is no point. In the samples they take the place of its
+    one echo."""
+
+    kind: Literal["uav", "vehicle", "agv", "pedestrian", "centres"]
+    """Kind of target: `uav`, `vehicle` and `agv` are 3GPP TR 38.901's with a centre on each face,
+    `pedestrian` has limbs that swing, `centres` are stated."""
+    size_m: Annotated[tuple[Positive, Positive, Positive], Field()] | None = None
+    """Width, length and height [m]; of a pedestrian the height counts. null, the default: 3GPP's,
+    1.5 x 1.6 x 0.7 (uav), 2 x 5 x 1.6 (vehicle), 1 x 0.5 x 0.5 (agv), 0.5 x 0.5 x 1.75."""
+    centres: tuple[Centre, ...] = ()
+    """Centres, for the kind `centres`. By default none."""
+
+    def applies(self, name: str) -> bool:
+        return name == "kind" or (name == "centres") == (self.kind == "centres")
+
+    def problems(self) -> Iterator[Problem]:
+        if bool(self.centres) != (self.kind == "centres"):
+            text = "go with kind centres, and kind centres with them"
+            yield Problem((("centres",), ("kind",)), text)
+        if self.size_m is not None and self.kind == "centres":
+            text = "has no meaning beside centres, which have places; remove it"
+            yield Problem((("size_m",), ("kind",)), text)
+
+
 class Waypoint(Node):
     """Where a UAV is at one time."""
 
@@ -363,6 +397,8 @@ class Uav(Node):
     """Radar cross-section of the UAV: how strong its echo is. By default that of a small UAV."""
     rotors: Rotors | None = None
     """Rotors whose blades modulate the UAV's echo. null, the default: none."""
+    extent: Extent | None = None
+    """Several scattering centres in place of one. null, the default: a point target."""
     clock_offset_s: Finite = 0.0
     """How late the UAV's clock is at time 0 [s]: what it sends arrives later by this, what it
     receives seems to arrive earlier. By default all clocks agree."""
@@ -414,9 +450,10 @@ class Uav(Node):
         if any(turned) and self.boresight != "velocity":
             text = "the waypoints' attitude_deg says where the UAV looks; leave one of the two out"
             yield Problem((("boresight",), ("waypoints",)), text)
-        if self.rotors is not None and self.rcs.model == "relative":
-            text = "have a cross-section in square metres; give the UAV another rcs.model"
-            yield Problem((("rotors",), ("rcs", "model")), text)
+        for key in ("rotors", "extent"):
+            if getattr(self, key) is not None and self.rcs.model == "relative":
+                text = "needs a cross-section in square metres; give the UAV another rcs.model"
+                yield Problem(((key,), ("rcs", "model")), text)
         if (speed := math.hypot(*self.velocity_mps)) > MAX_SPEED_MPS:
             yield Problem((("velocity_mps",),), _too_fast(speed))
         if self.waypoints is None and self.position_m is None:

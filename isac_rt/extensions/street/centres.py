@@ -27,8 +27,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from isac_rt.extensions.street.extent import fixed_of
 from isac_rt.extensions.street.motion import CentreModel, Motion
 from isac_rt.extensions.street.rotors import blades_of
+from isac_rt.extensions.street.walker import walker_of_flight
 from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathSet, make_paths, merge
@@ -52,11 +54,14 @@ def moving_centres(
     seed: int,
 ) -> MovingCentres:
     """Return the moving centres of all UAVs that have any."""
-    models = [
-        (name, blades_of(uav.rotors, waveform, seed, name))
-        for name, uav in swarm.uavs.items()
-        if uav.rotors is not None
-    ]
+    models: list[tuple[str, CentreModel]] = []
+    for name, uav in swarm.uavs.items():
+        if uav.extent is not None and uav.extent.kind == "pedestrian":
+            models.append((name, walker_of_flight(uav.extent, swarm, seed, name)))
+        elif uav.extent is not None:
+            models.append((name, fixed_of(uav.extent, seed, name)))
+        if uav.rotors is not None:
+            models.append((name, blades_of(uav.rotors, waveform, seed, name)))
     return MovingCentres(swarm, sections, waveform, arrays, models)
 
 
@@ -91,12 +96,18 @@ class MovingCentres:
         for name, model in self.models:
             rows = np.flatnonzero(target == name)
             if rows.size:
-                slots = self._slots_of_piece(paths, name, model, poses)
+                attitude = self._attitude(name, paths.epoch)
+                places = model.motion(np.array([paths.epoch])).place
+                reach = float(np.linalg.norm(places, axis=-1).max())
+                speed = model.speed + reach * float(np.linalg.norm(attitude.rate))
+                slots = self._slots_of_piece(paths, name, (speed, model.jerk), poses)
                 begin, time = self.pieces(slots, middle - paths.epoch)
-                offset = self._in_world(name, model.motion(paths.epoch + time), time, paths.epoch)
+                offset = attitude.turned(model.motion(paths.epoch + time), time)
                 for row in rows:
                     one = paths.select(np.array([row]))
-                    parts.append(self._copies(one, poses, (name, model), offset, (begin, time)))
+                    parts.append(
+                        self._copies(one, poses, (name, model, attitude), offset, (begin, time))
+                    )
         return merge(parts) if len(parts) > 1 else paths
 
     def report(self) -> list[dict[str, Any]]:
@@ -131,10 +142,15 @@ class MovingCentres:
         return (np.array([-np.inf, np.inf]) if middle.size == 1 else begin), middle
 
     def _slots_of_piece(
-        self, paths: PathSet, name: str, model: CentreModel, poses: Mapping[str, Pose]
+        self,
+        paths: PathSet,
+        name: str,
+        limits: tuple[float, float],
+        poses: Mapping[str, Pose],
     ) -> int:
         """Return the number of slots over which delays of the second order and constant directions
-        keep within `PHASE_ERROR`."""
+        keep within `PHASE_ERROR`; `limits`: speed [m/s] and jerk [m/s^3] of the centres."""
+        speed, jerk = limits
         w, antennas = self.waveform, self.arrays.at(paths.link)
         k = 2 * np.pi * (w.carrier_frequency + w.bandwidth) / SPEED_OF_LIGHT
         reach = [
@@ -143,44 +159,38 @@ class MovingCentres:
         ends = [poses[end] for end in paths.link]
         turning = sum(
             r
-            * (model.speed + np.linalg.norm(poses[name].velocity - end.velocity))
+            * (speed + np.linalg.norm(poses[name].velocity - end.velocity))
             / np.linalg.norm(poses[name].position - end.position)
             for r, end in zip(reach, ends, strict=True)
         )
         by_turning = PHASE_ERROR / max(k * turning, np.finfo(float).tiny)
-        by_delay = (3 * PHASE_ERROR / max(k * model.jerk, np.finfo(float).tiny)) ** (1 / 3)
+        by_delay = (3 * PHASE_ERROR / max(k * jerk, np.finfo(float).tiny)) ** (1 / 3)
         return int(np.clip(2 * min(by_turning, by_delay) / w.slot_duration, 1, w.num_chirps))
 
-    def _in_world(self, name: str, own: Motion, time: np.ndarray, epoch: float) -> Motion:
-        """Turn the motion in a body's axes by its attitude, to the second order in a frame."""
+    def _attitude(self, name: str, epoch: float) -> Attitude:
+        """Return a UAV's attitude about the epoch, to the second order in a frame."""
         half = self.waveform.frame_duration / 2
         before, now, after = (body_axes(self.swarm, name, epoch + t) for t in (-half, 0.0, half))
         ahead, behind = (Rotation.from_matrix(a @ now.T).as_rotvec() for a in (after, before))
-        rate, accel, t = (ahead - behind) / (2 * half), (ahead + behind) / half**2, time[:, None]
-        axes = Rotation.from_rotvec((rate + accel * t / 2) * t).as_matrix() @ now
-        spin, faster = (rate + accel * t)[:, None] @ axes, (accel @ axes)[:, None]  # body axes
-        turning = np.cross(spin, own.place)
-        velocity = own.velocity + turning
-        acceleration = own.acceleration + np.cross(spin, 2 * own.velocity + turning)
-        acceleration += np.cross(faster, own.place)
-        return Motion(*(m @ axes.swapaxes(1, 2) for m in (own.place, velocity, acceleration)))
+        return Attitude(now, (ahead - behind) / (2 * half), (ahead + behind) / half**2)
 
     def _copies(
         self,
         base: PathSet,
         poses: Mapping[str, Pose],
-        of: tuple[str, CentreModel],
+        of: tuple[str, CentreModel, Attitude],
         offset: Motion,
         slots: tuple[np.ndarray, np.ndarray],
     ) -> PathSet:
         """Return the copies of one path to all centres in all slots."""
-        (begin, time), (name, model) = slots, of
+        (begin, time), (name, model, attitude) = slots, of
         sent, received = end_images(base, poses, name)
         there = segment(sent, time, offset)
         back = there if received is sent else segment(received, time, offset)
         towards = [poses[name].to_body(image.towards) for image in (sent, received)]
         section = self.sections[name].square_metres(*towards)
-        amplitude = model.amplitudes() * (base.gain / np.sqrt(section))
+        by_axes = (image.towards @ attitude.axes for image in (sent, received))
+        amplitude = model.amplitudes(*by_axes) * (base.gain / np.sqrt(section))
         rate = (there.rate + back.rate) / SPEED_OF_LIGHT
         accel = (there.accel + back.accel) / SPEED_OF_LIGHT
         t = time[:, None]
@@ -210,17 +220,40 @@ class MovingCentres:
         )
 
 
+class Attitude(NamedTuple):
+    """Axes of a UAV's body at an epoch, (3, 3) columns right, ahead and up, and the rate [rad/s]
+    and acceleration of their rotation vector, (3,) each in world axes."""
+
+    axes: np.ndarray
+    rate: np.ndarray
+    accel: np.ndarray
+
+    def turned(self, own: Motion, time: np.ndarray) -> Motion:
+        """Return a motion in the body's axes in world axes, at times (T,) [s since the epoch]."""
+        t = time[:, None]
+        turn = Rotation.from_rotvec((self.rate + self.accel * t / 2) * t)
+        axes = turn.as_matrix() @ self.axes
+        spin = (self.rate + self.accel * t)[:, None] @ axes  # in body axes
+        turning = np.cross(spin, own.place)
+        velocity = own.velocity + turning
+        acceleration = own.acceleration + np.cross(spin, 2 * own.velocity + turning)
+        acceleration += np.cross((self.accel @ axes)[:, None], own.place)
+        return Motion(*(m @ axes.swapaxes(1, 2) for m in (own.place, velocity, acceleration)))
+
+
 def body_axes(swarm: Swarm, name: str, time: float) -> np.ndarray:
     """Return the axes of a UAV's body at a time [s], (3, 3) columns right, ahead and up.
 
-    They are the waypoints' attitude where that is stated. Else Z points along the thrust that the
-    flight needs in still air without drag, acceleration plus gravity, and Y where the UAV looks.
+    They are the waypoints' attitude where that is stated. Else Y is where the UAV looks, and Z
+    along the thrust that the flight needs in still air without drag, acceleration plus gravity; of
+    what stands on the ground it is up.
     """
     uav, pose = swarm.uavs[name], swarm.trajectories[name].pose(time)
     own = pose.rotation @ turned(uav.mount_deg).as_matrix().T
     if uav.waypoints is not None and uav.waypoints[0].attitude_deg is not None:
         return own
-    up = pose.acceleration + GRAVITY
+    stands = uav.extent is not None and uav.extent.kind in ("vehicle", "agv", "pedestrian")
+    up = GRAVITY if stands else pose.acceleration + GRAVITY
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > LEAST_THRUST else GRAVITY / GRAVITY[2]
     right = np.cross(own[:, 1], up)
     if np.linalg.norm(right) < 1e-6:  # it looks straight up or down

@@ -36,8 +36,9 @@ class CentreModel(Protocol):
         """Return what is modelled, in words for the plan."""
         ...
 
-    def amplitudes(self) -> np.ndarray:
-        """(K,) square root of each centre's cross-section [m]."""
+    def amplitudes(self, incident: np.ndarray, observed: np.ndarray) -> np.ndarray:
+        """(K,) square root of each centre's cross-section [m] towards source and observer, unit
+        vectors (3,) in the body's axes."""
         ...
 
     def motion(self, time: np.ndarray) -> Motion:

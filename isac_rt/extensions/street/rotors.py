@@ -74,7 +74,7 @@ class Blades:
         ends = np.isclose(self.radius, self.radius.max()).sum()
         return f"{self.radius.size // each} rotors, {ends} blades as {self.radius.size} points"
 
-    def amplitudes(self) -> np.ndarray:
+    def amplitudes(self, incident: np.ndarray, observed: np.ndarray) -> np.ndarray:
         """(K,) square root of each point's cross-section [m]."""
         return self.amplitude
 

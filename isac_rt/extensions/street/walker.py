@@ -16,6 +16,9 @@ from typing import ClassVar
 import numpy as np
 
 from isac_rt.extensions.street.motion import Motion
+from isac_rt.randomness import generator
+from isac_rt.world.settings import Extent
+from isac_rt.world.swarm import Swarm
 
 CYCLE = 1.346
 THIGH, LEG, SHOULDER, ARM = 0.245, 0.53, 0.82, 0.44
@@ -25,6 +28,8 @@ HIP_X, SHOULDER_X = 0.055, 0.13
 """Sideways distance of hip and shoulder from the middle over the body's height."""
 POINTS = {"trunk": 48, "leg": 24, "arm": 16}
 """Centres of each part: 128 of a pedestrian, 4 cm apart."""
+PLACES = 1000
+"""Places at which the length of a flight is measured."""
 LARGEST_SWING = np.radians(40.0)
 
 
@@ -66,7 +71,7 @@ class Walker:
         """Return the limbs in words."""
         return f"trunk and four limbs as {self.length.size} points"
 
-    def amplitudes(self) -> np.ndarray:
+    def amplitudes(self, incident: np.ndarray, observed: np.ndarray) -> np.ndarray:
         """(K,) square root of each point's cross-section [m]."""
         return np.full(self.length.size, np.sqrt(self.section / self.length.size))
 
@@ -84,15 +89,24 @@ class Walker:
         return Motion(self.hinge + np.stack([flat, ahead, up], axis=-1), velocity, acceleration)
 
 
-def walker_of(height: float, speed: float, section: float, start: float) -> Walker:
-    """Return the centres of a pedestrian whose position is the middle of the trunk's foot.
+HUMAN_DBSM, HEIGHT_M = -1.37, 1.75
+"""Mean cross-section (TR 38.901, human, RCS model 1) and height of an adult (table 7.9.1-3)."""
 
-    Parameters
-    ----------
-    height, speed : [m, m/s]
-    section : cross-section [m^2]
-    start : phase of the right leg at time 0 [rad]
-    """
+
+def walker_of_flight(extent: Extent, swarm: Swarm, seed: int, name: str) -> Walker:
+    """Return the centres of a pedestrian who walks at the mean speed of the flight, with a phase
+    drawn by name."""
+    flight = swarm.trajectories[name]
+    times = np.linspace(0.0, max(swarm.duration, 1.0), PLACES)
+    way = np.linalg.norm(np.diff(flight.positions(times), axis=0), axis=1).sum()
+    height = HEIGHT_M if extent.size_m is None else extent.size_m[2]
+    start = generator(seed, "walker", name).uniform(0, 2 * np.pi)
+    return walker_of(height, float(way) / times[-1], 10 ** (HUMAN_DBSM / 10), start)
+
+
+def walker_of(height: float, speed: float, section: float, start: float) -> Walker:
+    """Return the centres of a pedestrian of a height [m] and a speed [m/s], whose position is the
+    height of the hips; `section` [m^2], and `start`: phase of the right leg at time 0 [rad]."""
     thigh, leg = THIGH * height, LEG * height
     rate = 2 * np.pi * np.sqrt(speed * thigh) / (CYCLE * thigh)
     step = speed * 2 * np.pi / rate / (4 * leg) if rate else 0.0

@@ -22,8 +22,7 @@ def samples(*changes):
 
 def test_blades_spread_over_all_velocities_of_their_range_cell():
     """The mean over velocities of what turning blades add is their mean power over a turn; blades
-    at rest add nothing beyond the body's cell. Planted bugs: `_slots_of_piece` returns 8; the
-    UAV's echo left out."""
+    at rest add nothing beyond the body's cell. Planted bug: `turning` without its sixtieth."""
     body, turning, still = (
         samples(*change)
         for change in (

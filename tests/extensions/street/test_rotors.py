@@ -145,7 +145,8 @@ def sum_of_points(setup, frame):
 def test_samples_are_the_sum_over_points_at_every_sample(rev_per_min):
     """0.05 % of the sum. Planted bugs: `delay_accel` of centres without that of the return;
     `delay` without the term in the square of the slot's time; the blade's places at time 0 in
-    every frame; velocity without that of the UAV in `leg`."""
+    every frame; velocity without that of the UAV in `segment`; pieces
+    of a hundred times the slots."""
     rotors = {"number": 2, "blade_length_m": 0.05, "arm_m": 0.3, "rev_per_min": rev_per_min}
     rotors["blade_dbsm"] = 10.0  # over the rounding of the body's samples
     setup = irt.prepare(scenario(rotors=rotors))

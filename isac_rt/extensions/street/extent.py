@@ -1,0 +1,150 @@
+r"""Scattering centres fixed on a target: 3GPP's with one on each face, or stated ones.
+
+TR 38.901 (v19) clause 7.9.2.1 has lobes of a vehicle, an automated guided vehicle (AGV) and a large
+UAV, each a target of one point (tables -2, -4, -6). Its tables of several points (-5, -7) follow
+from these to 0.02 dB by a rule that is applied to all three here: the floors of n lobes add to that
+of the one point, and the peaks lose what the other floors add,
+
+.. math:: F' = F - 10\lg n, \qquad 10^{P'/10} = 10^{P/10} - (n-1)\,10^{F'/10}
+
+The random component of each centre is a smooth field over the aspect (`CrossSection`), so that the
+sum is coherent over frames. Centres lie in the middle of the faces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from isac_rt.extensions.street.motion import Motion
+from isac_rt.propagation.rcs import (
+    LARGE_BISTATIC,
+    LARGE_LOBES,
+    TR38901_STD_DB,
+    CrossSection,
+    Lobe,
+    lobe_db,
+)
+from isac_rt.world.settings import Extent, Rcs
+
+
+class Kind(NamedTuple):
+    """Lobes of a target, k_1 and k_2 of eq. 7.9.2-3, the standard deviation of the random component
+    [dB], and width, length and height [m]."""
+
+    lobes: tuple[Lobe, ...]
+    bistatic: tuple[float, float]
+    std_db: float
+    size: tuple[float, float, float]
+
+
+KINDS = {
+    "uav": Kind(LARGE_LOBES, LARGE_BISTATIC, TR38901_STD_DB["large"], (1.5, 1.6, 0.7)),
+    "vehicle": Kind(
+        (
+            Lobe(90.0, 26.90, 79.70, 44.42, 20.75, 13.68),
+            Lobe(180.0, 36.32, 79.65, 36.73, 14.56, 7.50),
+            Lobe(270.0, 26.90, 79.70, 44.42, 20.75, 13.68),
+            Lobe(0.0, 40.54, 71.75, 29.13, 15.52, 8.45),
+            Lobe(None, np.inf, 0.0, 18.13, 21.26, 14.19),
+        ),
+        (6.0, 1.65),
+        3.41,
+        (2.0, 5.0, 1.6),  # TR 37.885, passenger vehicle
+    ),
+    "agv": Kind(
+        (
+            Lobe(0.0, 13.68, 90.0, 13.68, 13.02, 23.29),
+            Lobe(90.0, 15.53, 75.0, 20.03, 7.33, 17.60),
+            Lobe(180.0, 12.49, 90.0, 11.89, 11.01, 21.28),
+            Lobe(270.0, 15.53, 75.0, 20.03, 7.33, 17.60),
+            Lobe(None, np.inf, 0.0, 11.44, 11.79, 22.06),
+        ),
+        (12.0, 1.45),
+        2.51,
+        (1.0, 0.5, 0.5),
+    ),
+}
+"""Targets of TR 38.901 (tables 7.9.2.1-2, -4 and -6; sizes: tables 7.9.1-1 and -4, option 1)."""
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """Centres that rest in a target's axes, and the cross-section of each."""
+
+    places: np.ndarray
+    sections: tuple[Section, ...]
+
+    replaces_echo: ClassVar[bool] = True
+    speed: ClassVar[float] = 0.0
+    jerk: ClassVar[float] = 0.0
+
+    def described(self) -> str:
+        """Return the centres in words."""
+        return f"{len(self.places)} scattering centres"
+
+    def amplitudes(self, incident: np.ndarray, observed: np.ndarray) -> np.ndarray:
+        """(K,) square root of each centre's cross-section [m]."""
+        return np.sqrt([section(incident, observed) for section in self.sections])
+
+    def motion(self, time: np.ndarray) -> Motion:
+        """Return the centres' places, at rest."""
+        rest = np.zeros((time.size, *self.places.shape))
+        return Motion(self.places + rest, rest, rest)
+
+
+@dataclass(frozen=True)
+class Section:
+    """Cross-section of one centre: the same to all sides, or a lobe times a random field."""
+
+    lobe: Lobe
+    bistatic: tuple[float, float]
+    random: CrossSection | None = None
+
+    def __call__(self, incident: np.ndarray, observed: np.ndarray) -> float:
+        """Return the cross-section [m^2]."""
+        total = incident + observed
+        norm = float(np.linalg.norm(total))
+        bisector, half = total / max(norm, 1e-9), np.arccos(np.clip(norm / 2, 0.0, 1.0))
+        value = 10 ** (float(lobe_db(self.lobe, self.bistatic, bisector, half)) / 10)
+        return value * (
+            1.0 if self.random is None else float(self.random.square_metres(incident, observed))
+        )
+
+
+def fixed_of(extent: Extent, seed: int, name: str) -> Fixed:
+    """Return the centres of a target."""
+    if extent.kind == "centres":
+        stated = [Lobe(None, np.inf, 0.0, np.inf, c.value_dbsm, 0.0) for c in extent.centres]
+        places = np.array([c.position_m for c in extent.centres])
+        return Fixed(places, tuple(Section(lobe, (0.0, 0.0)) for lobe in stated))
+    kind = KINDS[extent.kind]
+    lobes = of_several(kind.lobes)
+    random = Rcs(model="constant", value_dbsm=0.0, fluctuation_db=kind.std_db)
+    sections = (
+        Section(lobe, kind.bistatic, CrossSection(random, f"{name}/{i}", seed))
+        for i, lobe in enumerate(lobes)
+    )
+    size = np.array(extent.size_m or kind.size)
+    return Fixed(np.array([_outward(lobe) for lobe in lobes]) * size / 2, tuple(sections))
+
+
+def of_several(lobes: tuple[Lobe, ...]) -> list[Lobe]:
+    """Return lobes of one point as those of as many points."""
+    out = []
+    for lobe in lobes:
+        floor = lobe.peak - lobe.depth - 10 * np.log10(len(lobes))
+        power = 10 ** (lobe.peak / 10) - (len(lobes) - 1) * 10 ** (floor / 10)
+        peak = float(10 * np.log10(power))
+        out.append(lobe._replace(peak=peak, depth=peak - floor))
+    return out
+
+
+def _outward(lobe: Lobe) -> np.ndarray:
+    """Return the normal of the face that a lobe leaves, in the target's axes."""
+    if lobe.azimuth is None:
+        return np.array([0.0, 0.0, 1.0 if lobe.zenith < 90 else -1.0])
+    azimuth = np.radians(lobe.azimuth)
+    return np.round([-np.sin(azimuth), np.cos(azimuth), 0.0])
