@@ -507,15 +507,17 @@ class Scenario(Node):
         """List what is wrong with the radars of one chirp, by the keys under which they state
         it."""
         name = next(n for n, u in alone.swarm.items() if u.role == "active")
-        for rule in (
+        rules = [
             alone._slot_problems,
             alone._fmcw_array_problems,
-            alone._fmcw_receiver_problems,
             alone._block_problems,
             alone._self_calibration_problems,
             alone._calibration_problems,
             alone._front_end_problems,
-        ):
+        ]
+        if alone.radio.scheme != self.radio.scheme:
+            rules.append(alone._fmcw_receiver_problems)
+        for rule in rules:
             for problem in rule():
                 keys = tuple(
                     ("swarm", name, *key) if key[0] in ("radio", "array") else key
