@@ -219,11 +219,18 @@ def test_a_bag_holds_the_points(tmp_path):
             message = store.deserialize_cdr(raw, connection.msgtype)
             part = cloud[cloud.observer == connection.topic.split("/")[1]]
             part = part[np.isclose(part.time, stamp * 1e-9, atol=1e-8)]
-            points = np.frombuffer(message.data, "<f4").reshape(message.width, 12)
+            layout = {
+                "names": [f.name for f in message.fields],
+                "formats": [{5: "<i4", 7: "<f4"}[f.datatype] for f in message.fields],
+                "offsets": [f.offset for f in message.fields],
+                "itemsize": message.point_step,
+            }
+            points = np.frombuffer(message.data, np.dtype(layout))
             assert message.header.frame_id == "world"
-            assert [f.name for f in message.fields][:4] == ["x", "y", "z", "cov_xx"]
-            assert np.allclose(points[:, :3], part[["x", "y", "z"]], rtol=1e-6)
-            assert np.allclose(points[:, 9:11], part[["velocity", "snr"]], rtol=1e-6)
+            for name in ("x", "y", "z", "cov_xx", "cov_zz", "velocity", "snr"):
+                assert np.allclose(points[name], part[name], rtol=1e-6)
+            kinds = np.append(d.kind.values, "none")
+            assert kinds[points["label"]].tolist() == part.label.tolist()
             found += message.width
     assert found == len(cloud) > 0
     assert [file.name for file in tmp_path.iterdir()] == ["run_bag"]
