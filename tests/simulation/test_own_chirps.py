@@ -7,6 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
+import yaml
 from oracles import mixed_chirps
 
 import isac_rt as irt
@@ -160,7 +161,6 @@ def test_the_longest_frame_sets_the_interval():
 
 
 def test_the_resolved_scenario_is_the_same_one():
-    import yaml
 
     scenario = irt.load(TREE)
     assert irt.load(yaml.safe_load(to_yaml(scenario))).model_dump() == scenario.model_dump()
@@ -221,3 +221,19 @@ def test_terminals_with_data_share_the_chirp():
     with pytest.raises(ScenarioError, match="terminals that send data share the chirp") as problem:
         irt.load(tree)
     assert "swarm.B.sensor" in str(problem.value)
+
+
+def test_a_radar_takes_its_boards_file(tmp_path):
+    """TI's configuration of one terminal, relative to the scenario's folder; the common interval
+    stays. Bug: the board's period for all."""
+    (tmp_path / "b.cfg").write_text(
+        "channelCfg 15 1 0\nadcCfg 2 1\nprofileCfg 0 77.5 20 7 40 0 0 30 1 128 5000 0 0 30\n"
+        "chirpCfg 0 0 0 0 0 0 0 1\nframeCfg 0 0 32 0 100 1 0\n"
+    )
+    tree = changed("B", sensor="b.cfg", radio={"samples_per_chirp": 64})
+    (tmp_path / "s.yaml").write_text(yaml.safe_dump(tree))
+    scenario = irt.load(tmp_path / "s.yaml")
+    radio = scenario.swarm["B"].radio
+    assert (radio.carrier_hz, radio.samples_per_chirp, radio.chirps_per_frame) == (77.5e9, 64, 32)
+    assert scenario.frame_interval_s == TREE["frame_interval_s"]
+    assert irt.prepare(scenario).of("B").waveform.slope == pytest.approx(30e12)
