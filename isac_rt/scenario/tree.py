@@ -486,19 +486,15 @@ class Scenario(Node):
     def _own_chirp_problems(self) -> Iterator[Problem]:
         """List what terminals cannot have of a chirp of their own."""
         for name, uav in self.swarm.items():
-            for key in ("sensor", "radio"):
-                if getattr(uav, key) is not None and self.radio.mode == "isac":
-                    message = "terminals that send data share the chirp; leave it out, or set "
-                    keys = ("swarm", name, key), ("radio", "mode")
-                    yield Problem(keys, f"{message}radio.mode: fmcw for all")
-                    break
-        modes = {name: uav.radio.mode for name, uav in self.swarm.items() if uav.radio is not None}
-        for name, mode in modes.items():
-            if self.radio.mode == "fmcw" != mode:
+            stated = [key for key in ("sensor", "radio") if getattr(uav, key) is not None]
+            if stated and self.radio.mode == "isac":
+                message = "terminals that send data share the chirp; leave it out, or set "
+                keys = ("swarm", name, stated[0]), ("radio", "mode")
+                yield Problem(keys, f"{message}radio.mode: fmcw for all")
+            elif uav.radio is not None and uav.radio.mode == "isac":
                 message = "is isac, and radio.mode of all terminals is fmcw; leave it out"
                 yield Problem((("swarm", name, "radio", "mode"), ("radio", "mode")), message)
-        if "isac" in modes.values():
-            return
+                return
         for one in self.by_chirp():
             if one is not self:
                 yield from self._problems_alone(one)
