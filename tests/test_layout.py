@@ -243,7 +243,7 @@ MAX_LINES = {
     "signal": 837,
     "receive": 6070,
     "track": 1931,
-    "scenario": 2044,
+    "scenario": 2070,
     "results": 3702,
     "simulation": 3678,
     "sweep": 2785,

@@ -171,8 +171,12 @@ def _places(path: Path) -> dict[str, Any]:
 
 
 def _flight(city: Any, folder: Path, directed: bool, path: Path) -> dict[str, Any]:
-    """Waypoints of a flight, from a log or a table. `directed`: a stated boresight stands in place
-    of a log's attitudes."""
+    """Waypoints of a flight, from a log or a table, smoothed where ~SECONDS follow its name.
+    `directed`: a stated boresight stands in place of a log's attitudes."""
+    name, mark, period = str(path).rpartition("~")
+    if mark and not path.exists():
+        points = _flight(city, folder, directed, Path(name))["waypoints"]
+        return {"waypoints": _smoothed(points, number(period, 1, "~SECONDS"), Path(name).name)}
     log = extension("flight_log")(path)
     if log is None:
         return _flight_table(city, folder, path)
@@ -188,6 +192,30 @@ def _flight(city: Any, folder: Path, directed: bool, path: Path) -> dict[str, An
         for point, angles in zip(out, log.attitudes.tolist(), strict=True):
             point["attitude_deg"] = angles
     return {"waypoints": out}
+
+
+def _smoothed(points: list[dict[str, Any]], period: float, file: str) -> list[dict[str, Any]]:
+    """Return waypoints on a smoothing spline, which halves motions of a period [s] and leaves out
+    faster ones.
+
+    The spline minimises sum (y - f)^2 + w int f''^2. With n points a second it passes a motion of
+    angular frequency o by 1/(1 + w o^4/n), hence w = n (period/(2 pi))^4 (C. Reinsch, "Smoothing
+    by spline functions", Numerische Mathematik 10, 1967).
+    """
+    from scipy.interpolate import make_smoothing_spline
+
+    if period <= 0 or len(points) < 5:
+        raise ValueError(f"~{period:g}: smoothing needs a positive period and 5 positions or more")
+    places = np.array([point["position_m"] for point in points])
+    times = np.array([point["time_s"] for point in points])
+    if (np.diff(times) <= 0).any():
+        raise ValueError("its times must rise for smoothing; sort the rows")
+    weight = len(points) / np.ptp(times) * (period / (2 * np.pi)) ** 4
+    smooth = make_smoothing_spline(times, places, lam=weight)(times)
+    moved = np.sqrt(((smooth - places) ** 2).sum(axis=1).mean())
+    INPUT_NOTES.info(f"{file}: smoothed over {period:g} s, positions move by {moved:.2g} m (RMS)")
+    rows = zip(points, smooth.tolist(), strict=True)
+    return [{**point, "position_m": position} for point, position in rows]
 
 
 def _flight_table(city: Any, folder: Path, path: Path) -> dict[str, Any]:

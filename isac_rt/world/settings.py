@@ -383,8 +383,8 @@ class Uav(Node):
     of `position_m` and `velocity_mps`."""
     flight: str | None = None
     """File instead of `waypoints`: CSV with time_s, x, y, z [m], or time_s, lat, lon, alt, and
-    optionally yaw_deg, pitch_deg, roll_deg; or a log of PX4, ROS 2 or SUMO as FILE#PART@START. The
-    path is relative to the scenario's folder."""
+    optionally yaw_deg, pitch_deg, roll_deg; or a log of PX4, ROS 2 or SUMO as FILE#PART@START. A
+    final ~SECONDS smooths it. The path is relative to the scenario's folder."""
     mount_deg: Vector = (0.0, 0.0, 0.0)
     """How the arrays are turned against the UAV's own frame: yaw to the right, pitch up, roll
     [degrees], as of a radar that looks sideways from a car. By default they look ahead."""

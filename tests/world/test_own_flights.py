@@ -62,6 +62,30 @@ def test_a_flight_from_csv_is_met_and_moves_as_it_says(tmp_path):
     assert load(tmp_path / "again.yaml").model_dump() == s.model_dump()
 
 
+def test_a_smoothed_flight_loses_what_is_faster(tmp_path, caplog):
+    """Sines of 20, 5 and 1 s, sampled at 10 Hz and smoothed over 5 s: gains 1/(1 + (5/period)^4) in
+    the middle of the log, straight flight to the last digits. Bugs: the period for the time
+    constant; the weight without the number of points a second."""
+    t = np.arange(0, 120, 0.1)
+    place = np.stack([np.sin(2 * np.pi * t / period) for period in (20, 5, 1)], axis=1)
+    place += t[:, None] * [1.0, -2.0, 0.5]
+    flight(tmp_path, np.column_stack([t, place]))
+    with caplog.at_level("INFO", "isac_rt.inputs"):
+        scene = (tmp_path / "scene.yaml").read_text().replace("flight.csv", "flight.csv~5")
+        s = scenario(tmp_path, scene=scene)
+    found = np.array([w.position_m for w in s.swarm["T"].waypoints])
+    left = found - t[:, None] * [1.0, -2.0, 0.5]
+    middle = slice(400, 800)
+    for axis, period in enumerate((20, 5, 1)):
+        truth = np.sin(2 * np.pi * t / period) / (1 + (5 / period) ** 4)
+        assert left[middle, axis] == pytest.approx(truth[middle], abs=3e-3)
+    assert "flight.csv: smoothed over 5 s, positions move by" in caplog.text
+    with pytest.raises(ScenarioError, match=r"swarm\.T\.flight.*~0: smoothing needs a positive"):
+        scenario(tmp_path, scene=scene.replace("~5", "~0"))
+    with pytest.raises(ScenarioError, match="~SECONDS = 'x' is no finite number"):
+        scenario(tmp_path, scene=scene.replace("~5", "~x"))
+
+
 def test_attitudes_by_hand():
     """Nose east is a yaw of 90 degrees; nose up; right side down. Bug: yaw counted from east."""
     assert turned((90, 0, 0)).as_matrix()[:, 1] == pytest.approx([1, 0, 0])
