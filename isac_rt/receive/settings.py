@@ -72,6 +72,9 @@ class Receivers(Node):
     min_range_m: Annotated[float, Field(ge=0)] = 2.0
     """Least range at which a terminal searches [m]; one way at an active terminal, path length at a
     passive one. The default leaves out the transmitter's leakage."""
+    excision_rate: Annotated[float, Field(gt=0, lt=0.1)] | None = None
+    """Probability that a sample of noise is excised as a foreign radar's (docs/weather.md); 1e-6
+    where there are some. null, the default: samples stay as they are."""
     clutter_filter: Literal["none", "zero_doppler", "runs"] = "none"
     """Clutter removal before detection. `none`, the default. `zero_doppler`: all that is static
     relative to an active terminal. `runs`, the paper's: the same in runs of 15 and more occupied

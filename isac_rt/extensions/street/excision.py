@@ -1,0 +1,49 @@
+"""Detection and excision of foreign chirps in IF samples: short in time where echoes are narrow in
+frequency.
+
+Of each chirp's windowed spectrum the lines are set aside, bins over the median by a false alarm
+probability. What is left is transformed back, and samples whose power over all antennas exceeds the
+threshold of noise at the same probability lose it: echoes, leakage and data, which are lines, stay
+whole, so that a strong one leaves no gap that spreads over the map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import scipy.fft
+from scipy.special import gammainccinv, gammaincinv
+
+from isac_rt.frame.cube import IFCube
+
+LEAST_WINDOW = 0.2
+"""Value of the window under which samples are left as they are, as receivers weigh them so little
+themselves."""
+
+
+def excised(cube: IFCube, rate: float) -> IFCube:
+    """Return samples without foreign chirps.
+
+    Parameters
+    ----------
+    rate : probability that a sample of noise is taken for one
+    """
+    samples, size = cube.samples, cube.waveform.num_samples
+    window = np.sin(np.pi * (np.arange(size) + 0.5) / size).astype(np.float32) ** 2
+    spectrum = scipy.fft.fft(samples * window)
+    power = spectrum.real**2 + spectrum.imag**2
+    # the power of noise in a bin is exponential, its median ln 2 of the mean
+    most = np.median(power, axis=-1, keepdims=True) * (-np.log(rate) / np.log(2))
+    lines = power > most
+    spectrum[lines] = 0
+    rest = scipy.fft.ifft(spectrum)
+    # what is left of white noise: less of it, and that of the lines spread over the chirp
+    share = lines.mean()
+    noise = (1 - 2 * share) * window**2 + share * np.mean(window**2)
+    inside = window > LEAST_WINDOW
+    total = (rest.real**2 + rest.imag**2).sum(axis=1) / noise  # Gamma distributed
+    antennas = samples.shape[1]
+    threshold = gammainccinv(antennas, rate) / gammaincinv(antennas, 0.5)
+    level = np.median(total[..., inside], axis=(-2, -1), keepdims=True)
+    hit = (total > threshold * level) & inside
+    return replace(cube, samples=np.where(hit[:, None], samples - rest / window, samples))
