@@ -105,7 +105,7 @@ OF_CASES = {
         "departure = first - 1.01 * start.position",
     ),
     "every path of a box": Bug(
-        "propagation/segments/images.py", "some[:, 2 : 2 + count]", "some[:, 1 + count : 1 : -1]"
+        "propagation/segments/images.py", "pick[:, 2 : 2 + count]", "pick[:, 1 + count : 1 : -1]"
     ),
     "a wall 10 km off reflects once": Bug(
         "propagation/segments/geometry.py", "return which[first]", "return which"
@@ -131,8 +131,8 @@ OF_CASES = {
     "radar equation": Bug("propagation/free_space.py", "(4 * np.pi) ** 3", "(4 * np.pi) ** 2"),
     "two rays across the breakpoint": Bug(
         "propagation/raytrace.py",
-        "found.amplitude * state.elements",
-        "np.abs(found.amplitude) * state.elements",
+        "traced.amplitude * state.elements",
+        "np.abs(traced.amplitude) * state.elements",
     ),
     "conducting plate": Bug(
         "propagation/scatter_paths.py",
@@ -718,7 +718,7 @@ OF_TESTS = (
     ),
     (
         "test_metrics::test_targets_are_scored_among_all_uavs",
-        Bug("results/metrics.py", "other[track] = not scored[uav]", "other[track] = False"),
+        Bug("results/metrics.py", "beside[track] = not scored[uav]", "other[track] = False"),
     ),
     (
         "test_scoring::test_an_alias_or_a_drifted_track_does_not_stand_for_a_uav",

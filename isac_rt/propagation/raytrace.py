@@ -136,7 +136,7 @@ class RayTracer:
         return Census(
             len(self.field.cells),
             self.field.num_candidates,
-            {str(link): len(some.cells) for link, some in self.field.merged.items()},
+            {str(link): len(scatterers.cells) for link, scatterers in self.field.merged.items()},
             None if self.two_bounces is None else self.two_bounces.census(),
             round(self.field.overlap, 1),
         )
@@ -221,7 +221,7 @@ class RayTracer:
         for name, position in sinks.items():
             scene.add(rt.Receiver(f"rx-{name}", position=mi.Point3f(*position.tolist())))
         capacity = min((samples_per_src * max_depth + 1) * len(sinks), MOST_PATHS)
-        found = self._solver(
+        paths = self._solver(
             scene,
             max_depth=max_depth,
             samples_per_src=samples_per_src,
@@ -230,13 +230,13 @@ class RayTracer:
             synthetic_array=True,
             specular_reflection=max_depth > 0,
         )
-        valid = np.asarray(found.valid)  # (rx, tx, path): the array is synthetic
+        valid = np.asarray(paths.valid)  # (rx, tx, path): the array is synthetic
         most = valid.sum(axis=(0, 2)).max()
         if most >= MOST_PATHS:
             raise ValueError(
                 f"the ray tracer found its limit of {MOST_PATHS} paths; lower propagation.rays"
             )
-        return found
+        return paths
 
     def _solved_segments(self, local: dict[str, Pose], num_rays: int) -> TracedSegments:
         """Mirrored segments of Sionna's solver from every terminal to every UAV."""
@@ -253,13 +253,13 @@ class RayTracer:
             if depth > 1
             else {}
         )
-        found = self._solve(
+        paths = self._solve(
             sources,
             sinks | beside,
             max_depth=depth,
             samples_per_src=num_rays,
         )
-        amplitude, valid, faces, points = self._read(found, max(depth, 1))
+        amplitude, valid, faces, points = self._read(paths, max(depth, 1))
         corner = valid & ((faces >= 0).sum(axis=-1) > 1)
         out, dropped, duplicates = {}, 0, 0
         for j, start in enumerate(sources):
@@ -279,23 +279,23 @@ class RayTracer:
         return TracedSegments(out, dropped, duplicates)
 
     def _read(
-        self, found: rt.Paths, depth: int
+        self, paths: rt.Paths, depth: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Amplitudes (rx, tx, path), validity, faces (rx, tx, path, depth) and points (..., depth,
         3) of solved paths."""
-        real, imag = (np.asarray(part, np.float64) for part in found.a)
+        real, imag = (np.asarray(part, np.float64) for part in paths.a)
         shape = real.shape[0], real.shape[2], real.shape[4]
         amplitude = (real + 1j * imag).reshape(shape)
-        valid = np.asarray(found.valid).reshape(shape)
+        valid = np.asarray(paths.valid).reshape(shape)
         if not shape[2]:
             empty = np.zeros((*shape, depth), np.int64), np.zeros((*shape, depth, 3))
             return amplitude, valid, *empty
         faces = self._scenes.solved.face_index(
-            np.asarray(found.objects), np.asarray(found.primitives)
+            np.asarray(paths.objects), np.asarray(paths.primitives)
         )
-        hit = np.asarray(found.interactions) != 0
+        hit = np.asarray(paths.interactions) != 0
         faces = np.moveaxis(np.where(hit, faces, -1), 0, -1)
-        points = np.moveaxis(np.asarray(found.vertices, np.float64), 0, -2)
+        points = np.moveaxis(np.asarray(paths.vertices, np.float64), 0, -2)
         return amplitude, valid, faces, points
 
     def _segment_set(
@@ -365,16 +365,16 @@ class RayTracer:
             target_names=state.target_names,
         )
 
-    def _by_the_city(self, state: LinkState, found: SegmentSet) -> PathSet:
+    def _by_the_city(self, state: LinkState, traced: SegmentSet) -> PathSet:
         """Line of sight and mirror reflections of the city."""
-        scatter_paths = ScatterPaths.along(found.segments)
+        scatter_paths = ScatterPaths.along(traced.segments)
         return state.paths(
             scatter_paths,
-            found.amplitude * state.elements(self._free.arrays, scatter_paths),
-            np.where(found.bounces > 0, PathKind.SPECULAR, PathKind.LINE_OF_SIGHT),
-            bounces=found.bounces,
-            points=found.segments.points,
-            faces=found.faces,
+            traced.amplitude * state.elements(self._free.arrays, scatter_paths),
+            np.where(traced.bounces > 0, PathKind.SPECULAR, PathKind.LINE_OF_SIGHT),
+            bounces=traced.bounces,
+            points=traced.segments.points,
+            faces=traced.faces,
         )
 
     def _over_uavs(

@@ -90,11 +90,11 @@ class CachedPropagation:
         }
         text = json.dumps([self._content, epoch, links, where])
         key = hashlib.sha256(text.encode()).hexdigest()
-        found = self._store.get(key)
-        if found is None:
-            found = self.model.trace(poses, epoch, links), self.model.census()
-            self._store.put(key, *found)
-        traced, self._census = found
+        stored = self._store.get(key)
+        if stored is None:
+            stored = self.model.trace(poses, epoch, links), self.model.census()
+            self._store.put(key, *stored)
+        traced, self._census = stored
         return traced
 
 

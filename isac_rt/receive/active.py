@@ -51,8 +51,8 @@ class ActiveReceiver:
             spectra = spectra.copy()
             self.clutter_filter.clean(spectra, cube.schedule, codes_of(cube.waveform))
         spectra, known = known.decoded(spectra)
-        found = self.detector.sense(spectra, known, hints)
-        detections = found.detections
+        sensed = self.detector.sense(spectra, known, hints)
+        detections = sensed.detections
         if self.refiner is not None:
             moments = Moments(cube.samples, known)
             least = self.settings.min_range_m
@@ -60,14 +60,14 @@ class ActiveReceiver:
             if alone is not cube.samples:
                 moments = Moments(alone, known)
             detections = self.refiner(moments, detections)[0]
-        kept_maps = make_maps(found.power, cube, self.settings, 2) if maps else None
+        kept_maps = make_maps(sensed.power, cube, self.settings, 2) if maps else None
         out = Reception.undecoded(
-            cube.waveform, detections, kept_maps, found.sparse, found.correction
+            cube.waveform, detections, kept_maps, sensed.sparse, sensed.correction
         )
         if self.settings.self_calibration == "none":
             return out
-        measured = measure_channels(spectra, known, found.estimates, found.detections.snr)
-        return replace(out, path_channels=measured, neighbours=found.neighbours)
+        measured = measure_channels(spectra, known, sensed.estimates, sensed.detections.snr)
+        return replace(out, path_channels=measured, neighbours=sensed.neighbours)
 
 
 def receive_active(

@@ -50,8 +50,8 @@ def element_delays(
     """Delay of elements (E, 3) against the centroid for spherical waves from directions (..., 2)
     [s], (..., E), and its derivative with respect to u_x, u_z (2, ..., E); `radius` [m] one for all
     or (..., 1)."""
-    place = positions[:, [0, 2]]
-    along = direction @ place.T
-    axes = place.T.reshape(2, *(1,) * (along.ndim - 1), -1)
+    flat = positions[:, [0, 2]]
+    along = direction @ flat.T
+    axes = flat.T.reshape(2, *(1,) * (along.ndim - 1), -1)
     delay = (-along + ((positions**2).sum(axis=1) - along**2) / (2 * radius)) / SPEED_OF_LIGHT
     return delay, (-(1 + along / radius) * axes) / SPEED_OF_LIGHT

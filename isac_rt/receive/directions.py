@@ -74,8 +74,8 @@ class Lines:
         the line of its `number`, -1: in none."""
         members = tuple(np.flatnonzero(number == n) for n in np.unique(number[number >= 0]))
         spectra = [np.exp(1j * np.outer(u[axis], places[m, axis])) for m in members]
-        other = np.array([places[m[0], 1 - axis] for m in members])
-        phasors = np.exp(1j * np.outer(other, u[1 - axis])).astype(np.complex64)
+        across = np.array([places[m[0], 1 - axis] for m in members])
+        phasors = np.exp(1j * np.outer(across, u[1 - axis])).astype(np.complex64)
         return cls(members, tuple(s.astype(np.complex64) for s in spectra), phasors)
 
 
@@ -167,12 +167,12 @@ class Search:
         """By how much a wave half a step off the grid on both axes exceeds, in amplitude, the sum
         of what the lines have of it on the grid."""
         half = self.wavenumber * self.steps / 2
-        kept = [
+        gains = [
             abs(np.exp(1j * half[axis] * self.channels.positions[members, 2 * axis]).sum())
             for axis, lines in enumerate((self.along_x, self.along_z))
             for members in lines.members
         ]
-        return len(self.channels) / float(sum(kept))
+        return len(self.channels) / float(sum(gains))
 
     def spread(self, cosine: float) -> np.ndarray:
         """(L, L) by which a box of directions, so wide, tapers a covariance."""
@@ -274,14 +274,14 @@ def search_plain(x: np.ndarray, search: Search, noise: float, least: float) -> D
     if max(len(lines.members) for lines in (search.along_x, search.along_z)) > 1:
         bound = _axis_bound(x, search)
     peak, cosines = bound**2 * raised, np.full((cell.size, 2), np.nan)
-    some = np.flatnonzero(peak >= least)
-    y = np.ascontiguousarray(x[:, :, some].transpose(2, 0, 1))
+    rows = np.flatnonzero(peak >= least)
+    y = np.ascontiguousarray(x[:, :, rows].transpose(2, 0, 1))
     whole = np.full((1, *search.inside.shape), scale, np.float32)
-    peak[some], cosines[some] = strongest_on_grid(y, whole, search)
-    above = peak[some] >= least
-    some = some[above]
+    peak[rows], cosines[rows] = strongest_on_grid(y, whole, search)
+    above = peak[rows] >= least
+    rows = rows[above]
     statistic = statistic_of(y[above], scale=scale)
-    peak[some], cosines[some] = climbed(statistic, cosines[some], search)
+    peak[rows], cosines[rows] = climbed(statistic, cosines[rows], search)
     return DirectionPeaks(cell, peak, cosines)
 
 
@@ -292,7 +292,7 @@ def _axis_bound(x: np.ndarray, search: Search) -> np.ndarray:
     for lines in (search.along_x, search.along_z):
         total = np.zeros((1, x.shape[2]), np.float32)
         for members, spectra in zip(lines.members, lines.spectra, strict=True):
-            beams = [spectra @ look[members] for look in x]
+            beams = [spectra @ weights[members] for weights in x]
             total = total + np.sqrt(sum(beam.real**2 + beam.imag**2 for beam in beams))
         out += total.max(axis=0)
     return out
@@ -314,9 +314,9 @@ def search_white(
     inverse = inverses(R)
     y = np.matmul(x, inverse.transpose(0, 2, 1))
     peak, cosines = strongest_on_grid(y, 1 / denominators(inverse, search), search)
-    some = np.flatnonzero(peak >= least)
-    statistic = statistic_of(y[some], inverse[some])
-    peak[some], cosines[some] = climbed(statistic, cosines[some], search)
+    rows = np.flatnonzero(peak >= least)
+    statistic = statistic_of(y[rows], inverse[rows])
+    peak[rows], cosines[rows] = climbed(statistic, cosines[rows], search)
     a = search.steering(cosines)
     white = np.einsum("sij,sj->si", inverse, a)
     share = 1 - (np.abs(white) ** 2).sum(axis=1) / (a.conj() * white).sum(axis=1).real
@@ -346,14 +346,14 @@ def climbed(
 
     `statistic` is of steering vectors (S, D, L), (S, D).
     """
-    peak, each = np.zeros(len(cosines), np.float32), np.arange(len(cosines))
+    peak, rows = np.zeros(len(cosines), np.float32), np.arange(len(cosines))
     towards = search.steering(cosines)
     for part in CLIMBED:
         step = part * search.steps
         phasors = search.steering(step * AROUND)  # the phases of two directions add
         values = statistic(towards[:, None] * phasors)
         best = values.argmax(axis=1)
-        peak, cosines = values[each, best], cosines + step * AROUND[best]
+        peak, cosines = values[rows, best], cosines + step * AROUND[best]
         towards = towards * phasors[best]
     return peak, cosines
 
@@ -493,12 +493,12 @@ def strongest_on_grid(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Largest sum of |a^H y|^2 over the looks of y (S, T, L) times a scale (S or 1, G, H), and its
     direction, interpolated."""
-    peak, place = np.zeros(len(y), np.float32), np.zeros((len(y), 2), np.float32)
+    peak, cosines = np.zeros(len(y), np.float32), np.zeros((len(y), 2), np.float32)
     _, x, z = search.axes
     inside, first = search.inside.ravel().astype(np.float32), [u[0] for u in search.cosines]
     lines = search.lines(y)
-    search_directions(*lines, x.phasors, z.phasors, inside, scale.astype(np.float32), peak, place)
-    return peak, first + place * search.steps
+    search_directions(*lines, x.phasors, z.phasors, inside, scale.astype(np.float32), peak, cosines)
+    return peak, first + cosines * search.steps
 
 
 @twin_of(receive_directions.search_directions)

@@ -198,15 +198,15 @@ def make_maps(
     real, imag = parts[:, :half]
     lines = np.arange(num_rx * num_rows)[:, None] * num_chirps
     for tx in range(ends.size - 1):
-        own = slice(ends[tx], ends[tx + 1])
-        x = samples[lines + index[own].astype(np.int64) // 2]
+        part = slice(ends[tx], ends[tx + 1])
+        x = samples[lines + index[part].astype(np.int64) // 2]
         # the rows of the operator for opposite bins are conjugates
-        made = x @ (real[:, own] + 1j * imag[:, own]).T, x @ (real[:, own] - 1j * imag[:, own]).T
+        made = [x @ (real[:, part] + j * imag[:, part]).T for j in (1j, -1j)]
         opposite = made[1][:, (num_chirps - 1) // 2 : 0 : -1]
-        one = np.concatenate([made[0], opposite], axis=1).reshape(num_rx, num_rows, num_chirps)
-        power += (one.real**2 + one.imag**2).sum(axis=0)
+        whole = np.concatenate([made[0], opposite], axis=1).reshape(num_rx, num_rows, num_chirps)
+        power += (whole.real**2 + whole.imag**2).sum(axis=0)
         if len(maps):
-            maps[tx] = one
+            maps[tx] = whole
 
 
 def correlation_operator(waveform: Waveform, times: np.ndarray) -> np.ndarray:
@@ -271,8 +271,8 @@ def conventional_power(spectra: np.ndarray, known: Known) -> np.ndarray:
     power = np.zeros((num_rows, size), np.float32)
     for m in range(num_groups):
         for sent in known.sent_by:
-            own = spectra[m][..., sent[m]].reshape(-1, size) @ analyse.T
-            power += (own.real**2 + own.imag**2).reshape(num_rx, num_rows, size).sum(axis=0)
+            line = spectra[m][..., sent[m]].reshape(-1, size) @ analyse.T
+            power += (line.real**2 + line.imag**2).reshape(num_rx, num_rows, size).sum(axis=0)
     return np.fft.fftshift(np.tile(power / (num_groups * num_tx * num_rx), num_tx), axes=-1)
 
 

@@ -82,20 +82,20 @@ def advise(
     total, left = np.zeros(len(rows)), np.zeros(len(rows))
     for part, chosen in _sparse_samples(spectra, rows, known):
         vectors, limit = part.reshape(-1, chosen.size), recovery_limit(chosen.size, w.num_chirps)
-        found = pursued(vectors, chosen, w.num_chirps, limit)
+        atoms = pursued(vectors, chosen, w.num_chirps, limit)
         power = (part.real**2 + part.imag**2).sum(axis=(0, 2))
         total += power
-        left += power - found.explained.reshape(part.shape[:2]).sum(axis=0)
+        left += power - atoms.explained.reshape(part.shape[:2]).sum(axis=0)
         if limit != SPARSITY:
-            found = pursued(vectors, chosen, w.num_chirps, SPARSITY)
-        found.add_power(recovered)
-    some = spectra[:, :, rows]
-    power = np.mean(some.real**2 + some.imag**2, axis=(0, 1, 3))
+            atoms = pursued(vectors, chosen, w.num_chirps, SPARSITY)
+        atoms.add_power(recovered)
+    selected = spectra[:, :, rows]
+    power = np.mean(selected.real**2 + selected.imag**2, axis=(0, 1, 3))
     above = np.maximum(power - noise, 1e-3 * noise)
     size = w.num_chirps // w.num_tx
     # of the noise: each atom takes one dimension
-    kept = 1 - recovery_limit(size, w.num_chirps) / size
-    share = (left / np.maximum(total, 1e-300) * power - kept * noise) / above
+    least_share = 1 - recovery_limit(size, w.num_chirps) / size
+    share = (left / np.maximum(total, 1e-300) * power - least_share * noise) / above
     sparse = bool(np.average(share < MOST_UNEXPLAINED, weights=above) > 0.5)
     recovered /= len(spectra) * w.num_tx * spectra.shape[1]
     return sparse, np.fft.fftshift(recovered, axes=-1).astype(np.float32)
@@ -121,9 +121,9 @@ def omp(vectors: np.ndarray, chosen: np.ndarray, num_chirps: int, sparsity: int)
     .. [1] R. Rubinstein et al., "Efficient Implementation of the K-SVD Algorithm using Batch OMP",
     2008 (the Gram-matrix form).
     """
-    found = pursued(vectors, chosen, num_chirps, sparsity)
+    atoms = pursued(vectors, chosen, num_chirps, sparsity)
     out = np.zeros((len(vectors), num_chirps), np.complex64)
-    np.put_along_axis(out, found.support, found.amplitude, axis=1)
+    np.put_along_axis(out, atoms.support, atoms.amplitude, axis=1)
     return out
 
 

@@ -102,13 +102,13 @@ class PassiveReceiver:
             pilot = Known.unmodulated(w, cube.schedule, self.antennas, 1)
             spectra, known = cleaned(cube, pilot)
             moments = Moments(cube.samples, known)
-            found = self.detector.sense(spectra, known, hints)
-            detections, reference = self._earliest(found, known)
-            found = replace(
-                found, path_channels=self._measure_channels(spectra, known, detections, reference)
+            sensed = self.detector.sense(spectra, known, hints)
+            detections, reference = self._earliest(sensed, known)
+            sensed = replace(
+                sensed, path_channels=self._measure_channels(spectra, known, detections, reference)
             )
             detections, reference = self._alone(moments, detections, reference)
-            return self._reception(cube, moments, found, detections, reference, maps=maps)
+            return self._reception(cube, moments, sensed, detections, reference, maps=maps)
         symbols = None if prediction is None else self._read(cube, prediction)
         if prediction is None or symbols is None:
             power = np.zeros((w.num_range_cells, w.num_chirps))
@@ -117,7 +117,7 @@ class PassiveReceiver:
         read = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
         spectra, known = cleaned(cube, read)
         moments = Moments(cube.samples, known)
-        found, detections, reference = self._sense_data(spectra, moments, prediction, hints)
+        sensed, detections, reference = self._sense_data(spectra, moments, prediction, hints)
         decided = None
         if self.refiner is not None and reference is not None:
             decided = self._phases(moments, detections)
@@ -126,7 +126,9 @@ class PassiveReceiver:
             if np.abs(phasor - 1).max() > SAME_PHASE:
                 spectra = spectra * phasor.astype(np.complex64)[:, None, None]
                 moments = moments.read_by(replace(known, phases=decided.phases))
-                found, detections, reference = self._sense_data(spectra, moments, prediction, hints)
+                sensed, detections, reference = self._sense_data(
+                    spectra, moments, prediction, hints
+                )
         else:
             spread = velocity_spread(symbols, self.reader.order, prediction, w)
             detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))
@@ -134,7 +136,7 @@ class PassiveReceiver:
         wrong = transition_error_rate(symbols, self.reader.order) * symbols.transitions.size
         if decided is None and wrong > MOST_WRONG:
             chain = replace(self, refiner=None)
-        reception = chain._reception(cube, moments, found, detections, reference, maps=maps)
+        reception = chain._reception(cube, moments, sensed, detections, reference, maps=maps)
         return reception if reference is None else self._decoded(reception, symbols, w)
 
     def receive_over(
@@ -158,11 +160,11 @@ class PassiveReceiver:
         read = Known(w, cube.schedule, symbols.raw, symbols.phases, self.antennas, 1)
         spectra, known = cleaned(cube, read)
         moments = Moments(cube.samples, known)
-        found = self.detector.sense(spectra, known, hints)
-        detections, reference = self._alone(moments, *self._earliest(found, known))
+        sensed = self.detector.sense(spectra, known, hints)
+        detections, reference = self._alone(moments, *self._earliest(sensed, known))
         spread = velocity_spread(symbols, self.reader.order, path, w)
         detections = detections.widened(np.array([0.0, spread, 0.0, 0.0]))
-        reception = self._reception(cube, moments, found, detections, reference, maps=maps)
+        reception = self._reception(cube, moments, sensed, detections, reference, maps=maps)
         return self._decoded(reception, symbols, w)
 
     def of_symbols(self, symbols: Symbols, read: Waveform, waveform: Waveform) -> Reception | None:
@@ -237,12 +239,12 @@ class PassiveReceiver:
     ) -> tuple[Sensed, Detections, Estimate | None]:
         """Sense in a frame whose symbols are removed, with the reference put first."""
         known = moments.known
-        found = self.detector.sense(spectra, known, hints)
-        detections, reference = self._at_prediction(spectra, known, found, prediction)
-        found = replace(
-            found, path_channels=self._measure_channels(spectra, known, detections, reference)
+        sensed = self.detector.sense(spectra, known, hints)
+        detections, reference = self._at_prediction(spectra, known, sensed, prediction)
+        sensed = replace(
+            sensed, path_channels=self._measure_channels(spectra, known, detections, reference)
         )
-        return found, *self._alone(moments, detections, reference)
+        return sensed, *self._alone(moments, detections, reference)
 
     def _measure_channels(
         self,
@@ -272,28 +274,28 @@ class PassiveReceiver:
         both, power = separated
         line = float(power[both.is_reference][0])
         channels = reference.channels * np.sqrt(line / _power(reference))
-        kept = detections.select(_off(detections, both, moments.known) & ~detections.is_reference)
-        return Detections.joined([both, kept]), replace(reference, channels=channels)
+        clear = detections.select(_off(detections, both, moments.known) & ~detections.is_reference)
+        return Detections.joined([both, clear]), replace(reference, channels=channels)
 
-    def _earliest(self, found: Sensed, known: Known) -> tuple[Detections, Estimate | None]:
+    def _earliest(self, sensed: Sensed, known: Known) -> tuple[Detections, Estimate | None]:
         """Mark the earliest detection within REFERENCE_SPAN_DB of the strongest, if it is sure: the
         false-alarm rate is asked of the whole map here and not of one cell, or an empty pilot would
         now and then be acquired."""
-        d, rule = found.detections, self.detector.rule(known)
-        sure = d.snr > replace(rule, rate=rule.rate / found.power.size).threshold
+        d, rule = sensed.detections, self.detector.rule(known)
+        sure = d.snr > replace(rule, rate=rule.rate / sensed.power.size).threshold
         if not sure.any():
             return d, None
-        power = np.array([_power(e) for e in found.estimates])
+        power = np.array([_power(e) for e in sensed.estimates])
         sure &= power >= 10 ** (-REFERENCE_SPAN_DB / 10) * power.max()
         first = np.flatnonzero(sure)[np.argmin(d.range[sure])]
-        return replace(d, is_reference=np.arange(len(d)) == first), found.estimates[first]
+        return replace(d, is_reference=np.arange(len(d)) == first), sensed.estimates[first]
 
     def _at_prediction(
-        self, spectra: np.ndarray, known: Known, found: Sensed, prediction: Prediction
+        self, spectra: np.ndarray, known: Known, sensed: Sensed, prediction: Prediction
     ) -> tuple[Detections, Estimate | None]:
         """The reference within the gate, put first with its own estimate, and the other detections
         beside it."""
-        w, power = known.waveform, found.power
+        w, power = known.waveform, sensed.power
         row, column = predicted_cell(prediction, w)
         if not 0 <= row < len(power):
             return no_detections(), None
@@ -302,7 +304,7 @@ class PassiveReceiver:
         gate = power[np.ix_(rows, columns)]
         i, j = np.unravel_index(gate.argmax(), gate.shape)
         row, column = rows[i], columns[j]
-        snr = power[row, column] / found.level[row, column]
+        snr = power[row, column] / sensed.level[row, column]
         if not snr > self.detector.rule(known).factors(len(power))[row]:
             return no_detections(), None
         estimate = self.detector.estimates(
@@ -310,7 +312,7 @@ class PassiveReceiver:
         )[0]
         on_grid = self.detector.estimator.on_grid
         reference = describe([estimate], np.array([snr]), known, on_grid=on_grid)
-        d = found.detections
+        d = sensed.detections
         first = replace(reference, is_reference=np.ones(1, bool))
         return Detections.joined([first, d.select(_off(d, reference, known))]), estimate
 
@@ -318,19 +320,19 @@ class PassiveReceiver:
         self,
         cube: IFCube,
         moments: Moments,
-        found: Sensed,
+        sensed: Sensed,
         detections: Detections,
         reference: Estimate | None,
         *,
         maps: bool,
     ) -> Reception:
         """Return the refined detections, without the symbols."""
-        kept_maps = make_maps(found.power, cube, self.settings, 1) if maps else None
-        out = Reception.undecoded(cube.waveform, detections, kept_maps, found.sparse)
+        kept_maps = make_maps(sensed.power, cube, self.settings, 1) if maps else None
+        out = Reception.undecoded(cube.waveform, detections, kept_maps, sensed.sparse)
         if reference is not None:
             level = _power(reference)
             out = replace(
-                out, line_of_sight=True, reference_power=level, path_channels=found.path_channels
+                out, line_of_sight=True, reference_power=level, path_channels=sensed.path_channels
             )
         if self.refiner is None:
             return out

@@ -120,20 +120,20 @@ def pursue(
     whole = power.copy()
     noise = max(float(np.median(power)), 1e-30)
     masked = np.zeros(power.shape)  # power under which a cell holds a remainder
-    found: list[_Path] = []
-    while len(found) < settings.max_detections:
+    paths: list[_Path] = []
+    while len(paths) < settings.max_detections:
         above, level = rule.detect(power)
         above[:first] = False
         above &= power > masked
         rows, bins = peaks(power, above, (1, 1))
         keep = without_sidelobes(rows, bins, power, power.shape[1], floor)
-        rows, bins = (i[keep][: settings.max_detections - len(found)] for i in (rows, bins))
+        rows, bins = (i[keep][: settings.max_detections - len(paths)] for i in (rows, bins))
         if not rows.size:
             break
-        changed = _find(left, power, level, (rows, bins), found, masked, known, noise)
-        if len(found) < settings.max_detections:
+        changed = _find(left, power, level, (rows, bins), paths, masked, known, noise)
+        if len(paths) < settings.max_detections:
             _map_again(power, left, changed, known)
-    return [f.estimate for f in found], np.array([f.snr for f in found]), whole
+    return [f.estimate for f in paths], np.array([f.snr for f in paths]), whole
 
 
 class StrongPaths(NamedTuple):
@@ -165,17 +165,17 @@ def extract_strong(spectra: np.ndarray, known: Known, settings: Receivers) -> St
     power = whole.copy()
     noise = max(float(np.median(power)), 1e-30)
     masked, level = np.zeros(power.shape), np.full(power.shape, noise)
-    found: list[_Path] = []
+    extracted: list[_Path] = []
     for _ in range(STRONG_ROUNDS):
         above = power > np.maximum(noise * 10 ** (STRONG_DB / 10), masked)
         rows, bins = peaks(power, above, (1, 1))
         keep = without_sidelobes(rows, bins, power, power.shape[1], floor)
-        rows, bins = (i[keep][: settings.max_detections - len(found)] for i in (rows, bins))
+        rows, bins = (i[keep][: settings.max_detections - len(extracted)] for i in (rows, bins))
         if not rows.size:
             break
-        changed = _find(left, power, level, (rows, bins), found, masked, known, noise)
+        changed = _find(left, power, level, (rows, bins), extracted, masked, known, noise)
         maps[:, :, changed], power[changed] = maps_with_power(left[:, :, changed], known)
-    paths, snr = [f.estimate for f in found], np.array([f.snr for f in found])
+    paths, snr = [f.estimate for f in extracted], np.array([f.snr for f in extracted])
     return StrongPaths(paths, snr, whole, left, maps, power)
 
 
@@ -184,7 +184,7 @@ def _find(
     power: np.ndarray,
     level: np.ndarray,
     cells: tuple[np.ndarray, np.ndarray],
-    found: list[_Path],
+    paths: list[_Path],
     masked: np.ndarray,
     known: Known,
     noise: float,
@@ -200,8 +200,8 @@ def _find(
         _subtract(left, new[-1], known, noise)
         _mark(masked, row, column, peak)
         changed[slice(*new[-1].rows)] = True
-    found += new
-    _fit_again(left, found, len(new), known, noise, changed)
+    paths += new
+    _fit_again(left, paths, len(new), known, noise, changed)
     return changed
 
 
@@ -230,7 +230,7 @@ def _mark(masked: np.ndarray, row: int, column: int, peak: float) -> None:
 
 def _fit_again(
     spectra: np.ndarray,
-    found: list[_Path],
+    paths: list[_Path],
     count: int,
     known: Known,
     noise: float,
@@ -240,12 +240,12 @@ def _fit_again(
     taken out; in place, and mark the rows that are `changed`. A path that nothing touches stays as
     it is."""
     w = known.waveform
-    power = np.array([f.power for f in found])
+    power = np.array([f.power for f in paths])
     rate = 1 / (w.frame_duration * w.effective_carrier)
     cells = np.array(
         [
-            [w.beat_cells(f.estimate.delay, f.estimate.delay_rate).mean() for f in found],
-            [f.estimate.delay_rate / rate for f in found],
+            [w.beat_cells(f.estimate.delay, f.estimate.delay_rate).mean() for f in paths],
+            [f.estimate.delay_rate / rate for f in paths],
         ]
     )
     rows, bins = np.abs(cells[:, :, None] - cells[:, None, :])
@@ -255,12 +255,12 @@ def _fit_again(
     )
     touches = np.minimum(power[:, None], power) * lobes > MIN_INFLUENCE * noise
     np.fill_diagonal(touches, False)
-    fresh = np.arange(len(found)) >= len(found) - count
+    fresh = np.arange(len(paths)) >= len(paths) - count
     near = np.flatnonzero((touches & (fresh | fresh[:, None])).any(axis=1))
     for cycle in range(CYCLES):
         moved = []
         for k in near:
-            path, before = found[k], found[k].estimate
+            path, before = paths[k], paths[k].estimate
             _add(spectra, path, known, 1.0)
             changed[slice(*path.rows)] = True
             row = min(max(round(float(cells[0, k])), 0), spectra.shape[2] - 1)

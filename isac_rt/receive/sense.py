@@ -125,8 +125,8 @@ class Cfar:
         rows, bins = strongest_peaks(power, above, self.settings, UNION_FLOOR)
         estimates = self.estimates(spectra, known, power, rows, bins)
         snr = power[rows, bins] / level[rows, bins]
-        found = describe(estimates, snr, known, on_grid=self.estimator.on_grid)
-        return Sensed(estimates, found, power, level, sparse)
+        detections = describe(estimates, snr, known, on_grid=self.estimator.on_grid)
+        return Sensed(estimates, detections, power, level, sparse)
 
 
 def doppler_of(known: Known) -> LatinUnion:
@@ -195,8 +195,8 @@ def equivalent_range_power(cube: IFCube) -> np.ndarray:
     """Return the mean power (N, P) over the receivers by range cell and chirp of the first group,
     before data removal."""
     total = np.zeros((cube.samples.shape[3], cube.samples.shape[2]), np.float32)
-    for one in cube.samples[0]:
-        spectrum = scipy.fft.fft(one, axis=1, workers=1)
+    for group in cube.samples[0]:
+        spectrum = scipy.fft.fft(group, axis=1, workers=1)
         total += (spectrum.real**2 + spectrum.imag**2).T
     return total / cube.samples.shape[1]
 

@@ -108,13 +108,13 @@ class Receivers(Node):
                 f"is less than false_alarm_rate = {self.false_alarm_rate:g}, by which detections "
                 "start tracks; leave it out, or raise it",
             )
-        for key, (other, values) in COUNTS_WITH.items():
+        for key, (needed, values) in COUNTS_WITH.items():
             value, default = getattr(self, key), type(self).model_fields[key].default
-            if value != default and getattr(self, other) not in values:
+            if value != default and getattr(self, needed) not in values:
                 yield Problem(
-                    ((key,), (other,)),
-                    f"has no meaning with {other} {getattr(self, other)}, only with "
-                    f"{' or '.join(values)}; leave it out, or change {other}",
+                    ((key,), (needed,)),
+                    f"has no meaning with {needed} {getattr(self, needed)}, only with "
+                    f"{' or '.join(values)}; leave it out, or change {needed}",
                 )
 
     @property

@@ -106,8 +106,8 @@ def transform_plain(
 ) -> None:
     """`transform` with `scipy.fft`: the oracle, and what is used for an N that is no product of 8
     and twos, threes and fives."""
-    for r, one in enumerate(samples):
-        spectrum = scipy.fft.fft(one * factor, axis=1, workers=1, overwrite_x=True)
+    for r, group in enumerate(samples):
+        spectrum = scipy.fft.fft(group * factor, axis=1, workers=1, overwrite_x=True)
         if power is not None:
             power += spectrum.real**2 + spectrum.imag**2
         if tapered is not None:
@@ -209,7 +209,7 @@ def cleaned(cube: IFCube, known: Known) -> tuple[np.ndarray, Known]:
     what the first of them knew. Whoever changes the spectra changes a copy."""
     if not isinstance(cube, SharedCube):
         return clean_spectrum(cube, known), known
-    kept = cube.made.get("cleaned")
-    if kept is None or not kept[1].alike(known):
-        kept = cube.made["cleaned"] = clean_spectrum(cube, known), known
-    return kept
+    cached = cube.made.get("cleaned")
+    if cached is None or not cached[1].alike(known):
+        cached = cube.made["cleaned"] = clean_spectrum(cube, known), known
+    return cached

@@ -188,8 +188,8 @@ def demodulate(
         raw[m], sure[m] = decide(power, [(g, o[m]) for g, o in others], w)
         picked[m] = spectra[:, raw[m] - cells[0], np.arange(shape[1])]
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)
-    known = known_cycles(w, delays[0], rates[0], raw)
-    picked *= np.exp(-2j * np.pi * known)[:, None, :]
+    cycles = known_cycles(w, delays[0], rates[0], raw)
+    picked *= np.exp(-2j * np.pi * cycles)[:, None, :]
     summed, share = transition_sums(picked, cube.schedule, w.num_tx)
     transitions, spread = nearest_symbols(summed, dpsk_order)
     times = by_antenna(w.middle_time + raw * w.delay_step, cube.schedule, w.num_tx)
@@ -328,8 +328,8 @@ def moves_as_predicted(symbols: Symbols, order: int) -> bool:
     spread = symbols.phase_spread if least is None else min(least, symbols.phase_spread)
     if from_noise > 0.6 * anywhere:
         return True
-    other = symbols.gathering is not None and symbols.gathering.elsewhere(order * from_noise)
-    return bool(spread < 0.8 * anywhere) and not other
+    elsewhere = symbols.gathering is not None and symbols.gathering.elsewhere(order * from_noise)
+    return bool(spread < 0.8 * anywhere) and not elsewhere
 
 
 def transition_noise(symbols: Symbols) -> float:
@@ -415,13 +415,13 @@ def decide_phases(moments: Moments, path: JointPath, order: int) -> CarrierPhase
     for _ in range(ROUNDS):
         path = fit(moments, [path]).paths[0]
         matched = match_chirps(moments, path)
-        found = decide_by_carrier(known, matched * known.phases, order)
-        if found is None:
+        decision = decide_by_carrier(known, matched * known.phases, order)
+        if decision is None:
             break
-        decided = found
-        rate = path.delay_rate + found.offset * rate_bin(known.waveform)
+        decided = decision
+        rate = path.delay_rate + decision.offset * rate_bin(known.waveform)
         path = replace(path, delay_rate=rate)
-        known = replace(known, phases=found.phases)
+        known = replace(known, phases=decision.phases)
         moments = moments.read_by(known)
     return decided
 

@@ -309,8 +309,8 @@ class Reception:
         """The same frame read over another path than the line of sight; unless that is `named`,
         what it shows has no place."""
         d = self.detections
-        found = replace(d, is_reference=np.zeros(len(d), bool)) if named else no_detections()
-        return replace(self, detections=found, line_of_sight=False, placed=named)
+        remaining = replace(d, is_reference=np.zeros(len(d), bool)) if named else no_detections()
+        return replace(self, detections=remaining, line_of_sight=False, placed=named)
 
     def __repr__(self) -> str:
         data = f"{self.bits.size} bits decoded" if self.decoded else "no data decoded"

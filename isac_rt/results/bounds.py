@@ -60,8 +60,8 @@ class CramerRao:
         ahead = np.sqrt(max(1 - u_x**2 - u_z**2, 1e-9))
         level = u_x**2 + ahead**2
         jacobian = np.array([[1 / ahead, u_x * u_z / (ahead * level)], [0.0, 1 / np.sqrt(level)]])
-        known = np.where(np.outer(seen, seen), self.direction, 0.0)
-        angles = np.sqrt(np.diag(jacobian @ known @ jacobian.T))
+        covariance = np.where(np.outer(seen, seen), self.direction, 0.0)
+        angles = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
         out = np.array([self.range, self.velocity, *np.where(seen, angles, np.nan)])
         return np.asarray(out / np.sqrt(snr))
 

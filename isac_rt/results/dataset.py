@@ -58,8 +58,8 @@ def errors_of(values: xr.Dataset | Columns, group: str, name: str) -> np.ndarray
 def tracked_states(dataset: xr.Dataset) -> np.ndarray:
     """(K, 6) state of every track in world axes [m, m/s]: what its observer tracked, added to where
     the observer is."""
-    own = [list(dataset.uav.values).index(name) for name in dataset.receiver.values]
-    frame, uav = dataset.track_frame.values, np.array(own)[dataset.track_observer.values]
+    receivers = [list(dataset.uav.values).index(name) for name in dataset.receiver.values]
+    frame, uav = dataset.track_frame.values, np.array(receivers)[dataset.track_observer.values]
     of = [dataset[f"uav_{name}"].values[frame, uav] for name in ("position", "velocity")]
     return np.asarray(dataset.track_state.values + np.concatenate(of, axis=1))
 
@@ -190,7 +190,7 @@ def dataset_of(
         }
     _put_ragged(put, "det", "detection", "observer", [tables["det"][label] for label in labels])
     _put_ragged(put, "track", "track", "observer", [tables["track"][label] for label in labels])
-    found = {
+    variables = {
         part: [
             (i, j, shot[part][label])
             for i, shot in shots.items()
@@ -199,8 +199,8 @@ def dataset_of(
         ]
         for part in ("path", "maps")
     }
-    _put_paths(put, found["path"])
-    _put_maps(put, found["maps"], len(labels))
+    _put_paths(put, variables["path"])
+    _put_maps(put, variables["maps"], len(labels))
     _put_fused(put, tables, sizes)
     numbers = {"frame_interval_s": timetable.interval}
     waveforms = [timetable.of(link.tx).waveform for link in timetable.labels]
@@ -270,7 +270,7 @@ def _put_paths(put: Callable[..., None], found: Sequence[tuple[int, int, Columns
     count = [len(ledger["delay"]) for _, _, ledger in found]
     _put_index(put, "path", "path", "observer", np.repeat(index, count, axis=0))
     for name, column in PATHS.items():
-        parts: list[np.ndarray] = [np.asarray(one[name], column.dtype) for _, _, one in found]
+        parts: list[np.ndarray] = [np.asarray(of[name], column.dtype) for _, _, of in found]
         values = stacked(parts, column)
         put(f"path_{name}", ["path", *column.dims], values, column.units, column.meaning)
 
@@ -293,11 +293,11 @@ def _put_fused(put: Callable[..., None], tables: Tables, sizes: Mapping[str, int
 
 def _put_maps(
     put: Callable[..., None],
-    found: list[tuple[int, int, Mapping[str, np.ndarray]]],
+    maps: list[tuple[int, int, Mapping[str, np.ndarray]]],
     num_observers: int,
 ) -> None:
     """The maps of the snapshots, padded with NaN to the largest."""
-    shots = sorted({i for i, _, _ in found})
+    shots = sorted({i for i, _, _ in maps})
     put(
         "snapshot_frame",
         ["snapshot"],
@@ -307,11 +307,11 @@ def _put_maps(
     )
 
     def padded(name: str, dtype: type, snapshots: bool = True) -> np.ndarray:
-        shapes = [m[name].shape for _, _, m in found]
+        shapes = [m[name].shape for _, _, m in maps]
         size = [max(n, default=0) for n in zip(*shapes, strict=True)] or [0] * (1 + snapshots)
         head = (len(shots), num_observers) if snapshots else (num_observers,)
         out = np.full((*head, *size), np.nan if dtype is not bool else False, dtype)
-        for i, j, m in found:
+        for i, j, m in maps:
             at = (shots.index(i), j) if snapshots else (j,)
             out[(*at, *map(slice, m[name].shape))] = m[name]
         return out

@@ -147,20 +147,20 @@ def explain(
     if aim is None:
         aim = Aim(np.full((len(paths), 2), np.nan), np.ones(2))
     cause, near = np.full(len(detections), -1), np.zeros(len(detections), bool)
-    for q, some in enumerate(_candidates(detections, positions, aim, power, diffuse)):
-        best = some.cause()
+    for q, candidates in enumerate(_candidates(detections, positions, aim, power, diffuse)):
+        best = candidates.cause()
         if best >= 0:
-            cause[q], near[q] = some.path[best], some.near[best]
-    found = np.flatnonzero(cause >= 0)
-    rows, count = cause[found], len(detections)
+            cause[q], near[q] = candidates.path[best], candidates.near[best]
+    explained = np.flatnonzero(cause >= 0)
+    rows, count = cause[explained], len(detections)
     kinds, targets, orders, faces = (
         np.full(count, -1, dtype) for dtype in (np.int8, np.int16, np.int16, np.int32)
     )
-    kinds[found], targets[found], orders[found] = (
+    kinds[explained], targets[explained], orders[explained] = (
         column[rows] for column in (paths.kind, paths.target, paths.bounces)
     )
     met = np.append(paths.faces[rows], np.full((len(rows), 1), -1), axis=1)
-    faces[found] = met[np.arange(len(rows)), (met >= 0).argmax(axis=1)]
+    faces[explained] = met[np.arange(len(rows)), (met >= 0).argmax(axis=1)]
     return Explanation(kinds, targets, orders, faces, (cause >= 0) & ~near)
 
 

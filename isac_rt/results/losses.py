@@ -232,16 +232,16 @@ def _whitened_share(
     """
     city = (paths.kind == PathKind.DIFFUSE) | (paths.kind == PathKind.SPECULAR)
     near = np.abs(positions.range - centre[0]) < MAIN_LOBE * positions.cells[0]
-    some = np.flatnonzero(city & near)
-    beside = positions._replace(range=positions.range[some], velocity=positions.velocity[some])
+    rows = np.flatnonzero(city & near)
+    beside = positions._replace(range=positions.range[rows], velocity=positions.velocity[rows])
     row, column = beside.distances(*centre)
-    some, row, column = (values[column < MAIN_LOBE] for values in (some, row, column))
-    if not len(some):
+    rows, row, column = (values[column < MAIN_LOBE] for values in (rows, row, column))
+    if not len(rows):
         return 1.0
     mine = channels.steering(paths, np.array([own]))[0]
     groups = sees.rule.looks / len(mine)
-    power = groups * sees.cell * paths.power[some] * hann_response(row) * hann_response(column)
-    clutter = channels.steering(paths, some) * np.sqrt(power)[:, None]
+    power = groups * sees.cell * paths.power[rows] * hann_response(row) * hann_response(column)
+    clutter = channels.steering(paths, rows) * np.sqrt(power)[:, None]
     covariance = np.eye(len(mine)) + clutter.T @ clutter.conj()
     return float((mine.conj() @ np.linalg.solve(covariance, mine)).real / len(mine))
 
@@ -303,9 +303,9 @@ def _around(
     guard, training = sees.rule.guard, sees.rule.training
     off = positions.range - positions.range[own]
     most = max(guard[0] + training[0] + 1, 2) * positions.cells[0]
-    some = np.flatnonzero(~diffuse | (np.abs(off) < most))
-    off, level, field = off[some], power[some], diffuse[some]
-    near = positions._replace(range=positions.range[some], velocity=positions.velocity[some])
+    rows = np.flatnonzero(~diffuse | (np.abs(off) < most))
+    off, level, field = off[rows], power[rows], diffuse[rows]
+    near = positions._replace(range=positions.range[rows], velocity=positions.velocity[rows])
     row, column = near.distances(positions.range[own], positions.velocity[own])
     beside = field & (row < MAIN_LOBE) & (column < MAIN_LOBE)
     clutter = level[beside] @ (hann_response(row[beside]) * hann_response(column[beside]))

@@ -45,14 +45,14 @@ def truth_of(observer: Pose, uav: Pose, at: Pose | None = None) -> Truth:
     offset = uav.position - observer.position
     distance = sqrt(offset @ offset)
     velocity = float(offset @ (uav.velocity - observer.velocity)) / distance
-    body = observer.to_body(offset / distance)
+    direction = observer.to_body(offset / distance)
     length = distance
     if at is not None:
         outward = uav.position - at.position
         further = sqrt(outward @ outward)
         length += further
         velocity += float(outward @ (uav.velocity - at.velocity)) / further
-    right, ahead, up = body.tolist()
+    right, ahead, up = direction.tolist()
     return Truth(length, velocity, right, up, atan2(right, ahead), asin(min(max(up, -1.0), 1.0)))
 
 
@@ -102,9 +102,9 @@ class SymbolCount:
     bits_decoded: int = 0
     frames: int = 0
 
-    def __add__(self, other: SymbolCount) -> SymbolCount:
+    def __add__(self, more: SymbolCount) -> SymbolCount:
         return SymbolCount(
-            *(getattr(self, f) + getattr(other, f) for f in self.__dataclass_fields__)
+            *(getattr(self, f) + getattr(more, f) for f in self.__dataclass_fields__)
         )
 
 
@@ -202,10 +202,10 @@ def score_tracks(
     """
     distance = np.linalg.norm(tracks[:, None] - uavs[None], axis=-1)
     near = distance < GOSPA_CUTOFF_M
-    other = near[:, ~scored].any(axis=1)
+    beside = near[:, ~scored].any(axis=1)
     for track, uav in assigned(distance, GOSPA_CUTOFF_M):
-        other[track] = not scored[uav]
-    return gospa(uavs[scored], tracks[~other], GOSPA_CUTOFF_M), ~near.any(axis=1)
+        beside[track] = not scored[uav]
+    return gospa(uavs[scored], tracks[~beside], GOSPA_CUTOFF_M), ~near.any(axis=1)
 
 
 def decibels(ratio: float) -> float | None:

@@ -22,13 +22,13 @@ from isac_rt.world.area import city_digest, file_digest
 def versions_in_use() -> dict[str, str]:
     """The same, with what a loaded module says of itself where that is another version; each such
     difference is warned of once."""
-    found = versions()
-    for name, installed in found.items():
+    in_use = versions()
+    for name, installed in in_use.items():
         stated = getattr(sys.modules.get(name.replace("-", ".")), "__version__", installed)
         if stated != installed:
-            found[name] = f"{installed} (in use: {stated})"
-            _warn_of(name, found[name])
-    return found
+            in_use[name] = f"{installed} (in use: {stated})"
+            _warn_of(name, in_use[name])
+    return in_use
 
 
 @lru_cache

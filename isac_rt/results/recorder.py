@@ -149,9 +149,9 @@ class Recorder:
             alone._append(row)
         alone.dataset()
         alone.blocks()
-        kept = self.tables["frame"][""]
+        stored = self.tables["frame"][""]
         for frame, row in again:
-            if frame < 0 or kept[frame]["frame"] != row["frame"][""]["frame"]:
+            if frame < 0 or stored[frame]["frame"] != row["frame"][""]["frame"]:
                 raise ValueError(f"row {frame} is not of frame {row['frame']}")
         for frame, row in again:
             for label, changed in row["observer"].items():
@@ -268,19 +268,19 @@ def kept_of_paths(use: Columns) -> dict[str, Any]:
     ----------
     use : the values of `Use`, frame by frame
     """
-    kept = np.asarray(use["kept"])
-    order = np.argsort((kept > 0).argmax(axis=0), kind="stable")  # of the kinds as they come up
+    counts = np.asarray(use["kept"])
+    order = np.argsort((counts > 0).argmax(axis=0), kind="stable")  # of the kinds as they come up
 
     def mean(values: np.ndarray) -> float:
         return round(float(np.mean(values)), 2)
 
     return {
-        "frames": len(kept),
+        "frames": len(counts),
         **{
             f"{name}_per_frame": mean(use[name])
             for name in ("found", "filtered", "weak", "plane", "straight")
         },
-        "kept_per_frame": {KINDS[k]: mean(kept[:, k]) for k in order if kept[:, k].any()},
+        "kept_per_frame": {KINDS[k]: mean(counts[:, k]) for k in order if counts[:, k].any()},
         "bounces": int(use["bounces"].max()),
         "left_out_db": decibels(float(use["left_out"].max())),
         **{

@@ -158,8 +158,8 @@ class Scorer(Stateful):
         loss = np.full(count, -1, np.int8)
         for i, chance in chances.items():
             beside = labels.kind[self._beside(view.seen[i], d)]
-            own = bool((labels.uav == i).any())
-            loss[i] = cause_of(bool(hit[i]), own, beside, chance, sees, read)
+            detected = bool((labels.uav == i).any())
+            loss[i] = cause_of(bool(hit[i]), detected, beside, chance, sees, read)
 
         def by_uav(value: Callable[[Chance], float]) -> np.ndarray:
             return np.array([value(chances[i]) if i in chances else np.nan for i in range(count)])
@@ -200,25 +200,25 @@ class Scorer(Stateful):
     def _view(self, frame: int, paths: PathSet) -> _View:
         tx, rx = self.link
         poses = self._swarm.poses(self._timetable.epoch(frame, tx))  # of this link's own chirps
-        own, active = poses[rx], poses[tx]
+        pose, active = poses[rx], poses[tx]
         names = list(self._swarm.uavs)
         truth: list[Truth | None] = []
         for name in names:
             transmitter = active if self._passes == 1 and name != tx else None
-            truth.append(None if name == rx else truth_of(own, poses[name], transmitter))
+            truth.append(None if name == rx else truth_of(pose, poses[name], transmitter))
         inside = np.array(
             [name != rx and within_view(self._arrays, self.link, poses, name) for name in names]
         )
         own_paths = owners(paths.kind, paths.target, paths, names)
-        some = np.flatnonzero(own_paths >= 0)
-        some = some[~paths.select(some).bent]
+        rows = np.flatnonzero(own_paths >= 0)
+        rows = rows[~paths.select(rows).bent]
         straight = np.full(len(paths), -1)
-        straight[some] = own_paths[some]
-        direct = np.isin(np.arange(len(names)), straight[some])
+        straight[rows] = own_paths[rows]
+        direct = np.isin(np.arange(len(names)), straight[rows])
         seen = {i: t for i, t in enumerate(truth) if t is not None and inside[i] and direct[i]}
-        positions = np.array([poses[name].position - own.position for name in names])
-        directions = own.to_body(paths.arrival)[:, ::2]
-        return _View(own, truth, inside, direct, straight, seen, positions, directions)
+        positions = np.array([poses[name].position - pose.position for name in names])
+        directions = pose.to_body(paths.arrival)[:, ::2]
+        return _View(pose, truth, inside, direct, straight, seen, positions, directions)
 
     def _reported(self, frame: int) -> np.ndarray:
         """(U,) UAVs that are terminals in a frame and report their position; none in a swarm of
@@ -246,13 +246,13 @@ class Scorer(Stateful):
     ) -> DetectionLabels:
         beam = np.where(self._resolution.observed, self._resolution.width[2:], np.inf)
         aim = Aim(directions, beam)
-        found = explain(d, paths, self._timetable.waveform, self._passes, sees.cell, aim)
+        labels = explain(d, paths, self._timetable.waveform, self._passes, sees.cell, aim)
         names = list(self._swarm.uavs)
-        uav = owners(found.kind, found.target, paths, names)
+        uav = owners(labels.kind, labels.target, paths, names)
         index = np.array([names.index(name) for name in paths.target_names] + [-1], np.int16)
         return DetectionLabels(
-            **found._replace(target=index[found.target])._asdict(),
-            uav=np.where(found.sidelobe, -1, uav),
+            **labels._replace(target=index[labels.target])._asdict(),
+            uav=np.where(labels.sidelobe, -1, uav),
         )
 
     def _found(
@@ -301,7 +301,7 @@ class Scorer(Stateful):
         for i, k in assigned(cost, GATE_RESOLUTIONS):
             u, row = list(view.seen)[i], rows[k]
             follows[row], self.state.followed[u] = u, int(tracks.ids[row])
-        own = {int(follows[k]): int(k) for k in rows if 0 <= follows[k] == uav[k]}
+        first = {int(follows[k]): int(k) for k in rows if 0 <= follows[k] == uav[k]}
         of_nobody = np.zeros(len(tracks), bool)
         of_nobody[rows] = false & (follows[rows] < 0)
         table = TrackTable(
@@ -318,7 +318,7 @@ class Scorer(Stateful):
             uav=follows,
             false=of_nobody,
         )
-        return table, own
+        return table, first
 
     def _chances(
         self, view: _View, paths: PathSet, sees: Sensitivity, tx: Pose
@@ -330,8 +330,8 @@ class Scorer(Stateful):
         channels = Channels(self._antennas, wavenumber, tx, view.pose)
         for i in view.seen:
             mine = np.flatnonzero(view.straight == i)
-            own = int(mine[np.argmax(paths.power[mine])])
-            out[i] = Chance.of(own, paths, positions, w, sees, channels)
+            strongest = int(mine[np.argmax(paths.power[mine])])
+            out[i] = Chance.of(strongest, paths, positions, w, sees, channels)
         return out
 
     def _bound(self, view: _View, chances: dict[int, Chance]) -> UavValues:

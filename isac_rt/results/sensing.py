@@ -85,13 +85,13 @@ class Sensing:
         count, num_uavs = in_view.shape
 
         def errors(group: str) -> np.ndarray:
-            found = {
+            by_axis = {
                 name: values[f"bound_{name}"]
                 if group == "bound"
                 else errors_of(values, group, name)
                 for name in MEASURES
             }
-            in_units = [np.rad2deg(e) if MEASURES[n][0] == "rad" else e for n, e in found.items()]
+            in_units = [np.rad2deg(e) if MEASURES[n][0] == "rad" else e for n, e in by_axis.items()]
             return np.stack(in_units, axis=-1)
 
         def counted(what: np.ndarray, of: np.ndarray, most: int) -> np.ndarray:
@@ -194,7 +194,7 @@ class Sensing:
         in_view = int(seen.sum())
         return {
             "in_view": in_view,
-            **{name: share(int(one.sum()), in_view) for name, one in shares.items()},
+            **{name: share(int(mask.sum()), in_view) for name, mask in shares.items()},
             "bounds": _means(self.bounds[seen], BOUNDS),
             "snr_db": _means(self.snr[seen], SNR),
             "rmse": _by_axis(self.detected[detected], rms),
@@ -205,8 +205,8 @@ class Sensing:
 
 def _means(values: np.ndarray, names: Sequence[str]) -> dict[str, float | None]:
     """Average finite values (n, names) over target-frames; null of none."""
-    known = values[np.isfinite(values).all(axis=1)]
-    mean = known.mean(axis=0) if len(known) else [None] * len(names)
+    finite = values[np.isfinite(values).all(axis=1)]
+    mean = finite.mean(axis=0) if len(finite) else [None] * len(names)
     return {k: None if v is None else float(v) for k, v in zip(names, mean, strict=True)}
 
 
@@ -230,13 +230,13 @@ def gospa_block(parts: np.ndarray, seen: np.ndarray) -> dict[str, float | None]:
     if not len(parts):
         return dict.fromkeys(("total_m", "missed", "false", "localisation_m", "no_tracks_m"))
     localisation, missed, false = np.mean(parts, axis=0)
-    each = GOSPA_CUTOFF_M**2 / 2
+    penalty = GOSPA_CUTOFF_M**2 / 2
     return {
         "total_m": float(np.sqrt(localisation + missed + false)),
-        "missed": float(missed / each),
-        "false": float(false / each),
+        "missed": float(missed / penalty),
+        "false": float(false / penalty),
         "localisation_m": float(np.sqrt(localisation)),
-        "no_tracks_m": float(np.sqrt(each * seen.sum(axis=1).mean())),
+        "no_tracks_m": float(np.sqrt(penalty * seen.sum(axis=1).mean())),
     }
 
 
@@ -246,8 +246,8 @@ def _breaks(tracks: Columns, frame: np.ndarray, seen: np.ndarray) -> tuple[np.nd
     switched, resumed = np.zeros((2, *seen.shape), bool)
     last: dict[int, int] = {}
     lost: set[int] = set()
-    some = tracks["uav"] >= 0
-    uav, number, frame = tracks["uav"][some], tracks["id"][some], frame[some]
+    followed = tracks["uav"] >= 0
+    uav, number, frame = tracks["uav"][followed], tracks["id"][followed], frame[followed]
     edges = np.searchsorted(frame, np.arange(len(seen) + 1))
     for f, (begin, end) in enumerate(pairwise(edges)):
         follows = dict(zip(uav[begin:end].tolist(), number[begin:end].tolist(), strict=True))
@@ -270,8 +270,8 @@ def _by_axis(errors: np.ndarray, measure: Any) -> dict[str, float | None]:
     there are none."""
     out: dict[str, float | None] = {}
     for key, column in zip(ERROR_KEYS, errors.reshape(-1, len(ERROR_KEYS)).T, strict=True):
-        known = column[np.isfinite(column)]
-        out[key] = float(measure(known)) if known.size else None
+        finite = column[np.isfinite(column)]
+        out[key] = float(measure(finite)) if finite.size else None
     return out
 
 

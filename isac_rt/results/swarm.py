@@ -175,10 +175,10 @@ class SwarmScorer(Stateful):
         rows, out = np.flatnonzero(near.any(axis=1)), np.full(near.shape, np.inf)
         tracks = [replace(Pose.at_rest(s[:3]), velocity=s[3:]) for s in states[rows]]
         for link, seen in seen_by.items():
-            own, at = poses[link.rx], None if link.own else poses[link.tx]
-            points = np.array([truth_of(own, b, at)[:4] for b in tracks]).reshape(-1, 4)
+            receiver, at = poses[link.rx], None if link.own else poses[link.tx]
+            points = np.array([truth_of(receiver, b, at)[:4] for b in tracks]).reshape(-1, 4)
             for u in np.flatnonzero(seen):
-                truth = truth_of(own, [*poses.values()][u], at)
+                truth = truth_of(receiver, [*poses.values()][u], at)
                 out[rows, u] = np.minimum(out[rows, u], self._resolutions[link].off(truth, points))
         return np.where(near, out, np.inf)
 

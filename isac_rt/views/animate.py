@@ -117,8 +117,8 @@ class _Moving:
         for u, (path, here) in enumerate(zip(self._paths, self._here, strict=True)):
             path.set_data(position[: frame + 1, u, 0], position[: frame + 1, u, 1])
             here.set_data(position[frame : frame + 1, u, 0], position[frame : frame + 1, u, 1])
-        found = tracked_positions(self._d, frame, self._observer)
-        self._tracks.set_data(found[:, 0], found[:, 1])
+        positions = tracked_positions(self._d, frame, self._observer)
+        self._tracks.set_data(positions[:, 0], positions[:, 1])
         for name, marks in self._fused.items():
             fused = fused_positions(self._d, frame, name)
             marks.set_data(fused[:, 0], fused[:, 1])

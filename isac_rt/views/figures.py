@@ -410,12 +410,12 @@ def _maps(
 
 def _all(d: xr.Dataset, city: CityMesh | None, every: bool) -> Iterator[Drawing]:
     """The figures of a run; the maps of `every` snapshot or of the middle one."""
-    observers, kept = range(d.sizes["observer"]), d.sizes["snapshot"]
+    observers, snapshots = range(d.sizes["observer"]), d.sizes["snapshot"]
     yield Drawing("scene", [partial(scene_map, dataset=d, city=city)], 6.4)
-    for s in range(kept) if every else [kept // 2][:kept]:
+    for s in range(snapshots) if every else [snapshots // 2][:snapshots]:
         yield from _maps(d, s, "range_doppler", range_doppler, 4.1)
-    if kept:  # every frame shows the same
-        yield from _maps(d, kept // 2, "equivalent_range", equivalent_range, 3.2)
+    if snapshots:  # every frame shows the same
+        yield from _maps(d, snapshots // 2, "equivalent_range", equivalent_range, 3.2)
     for o in observers:
         of = ("range", "velocity", "azimuth")
         label = str(d.observer.values[o]).replace("->", "_to_")
@@ -517,12 +517,12 @@ def sweep_curves(
                 ax.fill_between(x, np.maximum(low, 1e-9), high, color=colour, alpha=0.15, lw=0)
             curve += 1
     if rate:
-        found = values.values[values.values > 0]
-        ax.set(yscale="log", ylim=(0.5 * found.min() if found.size else 1e-4, 1.5))
+        positive = values.values[values.values > 0]
+        ax.set(yscale="log", ylim=(0.5 * positive.min() if positive.size else 1e-4, 1.5))
     if values[against].dtype == object:
         ax.set_xticks(x, [str(v) for v in values[against].values])
-    kept = ", ".join(f"{d} {values[d].values}" for d in rest)
-    return labelled(ax, f"{against} ({dataset.attrs[f'axis_{against}']})", words(quantity), kept)
+    fixed = ", ".join(f"{d} {values[d].values}" for d in rest)
+    return labelled(ax, f"{against} ({dataset.attrs[f'axis_{against}']})", words(quantity), fixed)
 
 
 def make_sweep_figures(

@@ -283,8 +283,8 @@ def _world_angles(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(elevation, bearing) in world axes [rad] of body direction cosines (u_x, u_z), and their
     covariance by linear propagation."""
-    body = np.maximum(unit_vector(u), [-1.0, 1e-6, -1.0])
-    d, forward = rotation @ body, body[1]
+    direction = np.maximum(unit_vector(u), [-1.0, 1e-6, -1.0])
+    d, forward = rotation @ direction, direction[1]
     to_world = rotation @ np.array(
         [[1.0, 0.0], [-u[0] / forward, -u[1] / forward], [0.0, 1.0]]
     )  # d of direction by (u_x, u_z)

@@ -96,8 +96,8 @@ def map_limits(
         np.concatenate([r[cells], y, dataset.det_range.values[mine]]),
     )
     empty = np.zeros(0)
-    found = [_cut(a, o if level.any() else empty) for a, o in zip((v, r), occupied, strict=True)]
-    return found[0], found[1]
+    limits = [_cut(a, o if level.any() else empty) for a, o in zip((v, r), occupied, strict=True)]
+    return limits[0], limits[1]
 
 
 def _cut(axis: np.ndarray, occupied: np.ndarray) -> tuple[float, float]:

@@ -50,8 +50,8 @@ class Plots:
         self, observer: str | None = None, snapshot: int = -1, ax: Axes | None = None
     ) -> Axes:
         """Map of a link (by default the first) in one of the snapshots (the last)."""
-        kept = self._snapshot(snapshot)
-        return maps.range_doppler(_axes(ax), self.results.dataset, kept, self._number(observer))
+        number = self._snapshot(snapshot)
+        return maps.range_doppler(_axes(ax), self.results.dataset, number, self._number(observer))
 
     def tracks(
         self, observer: str | None = None, measure: Measure = "range", ax: Axes | None = None

@@ -45,10 +45,10 @@ def point_cloud(dataset: xr.Dataset) -> pd.DataFrame:
         at = [d[f"uav_{what}"].values[frame] for what in ("position", "velocity", "attitude")]
         pose = Pose(at[0][own], at[1][own], np.zeros(3), at[2][own])
         there = None if own == other else np.concatenate([at[0][other], at[1][other]])
-        found = _place(d, k, pose, there)
-        if found is None:
+        located = _place(d, k, pose, there)
+        if located is None:
             continue
-        place, covariance = found
+        place, covariance = located
         rows.append(
             {
                 "frame": int(d.frame.values[frame]),

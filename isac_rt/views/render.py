@@ -144,9 +144,9 @@ def shade(city: CityMesh, view: View, width: int, height: int) -> tuple[np.ndarr
     bottom."""
     corners = city.corners + city.origin
     depth, face = depth_buffer(corners, view, width, height)
-    picture = np.tile(_SKY, (height, width, 1))
+    image = np.tile(_SKY, (height, width, 1))
     if not city.num_faces:
-        return picture, depth
+        return image, depth
     seen = face >= 0
     normal = city.normals[face]
     normal = normal * np.where(np.sum(normal * view.axes[2], axis=-1, keepdims=True) > 0, -1.0, 1.0)
@@ -178,8 +178,8 @@ def shade(city: CityMesh, view: View, width: int, height: int) -> tuple[np.ndarr
         np.diff(normal, axis=0, prepend=0), axis=-1
     )
     edge = np.where((step > 3.0 + 8 * view.half[0] / width) | (curvature > 0.5), 0.72, 1.0)
-    picture[seen] = (base * (light * edge)[..., None])[seen]
-    return picture, depth
+    image[seen] = (base * (light * edge)[..., None])[seen]
+    return image, depth
 
 
 def best_view(city: CityMesh, tracks: np.ndarray, aspect: float) -> View:
@@ -288,12 +288,12 @@ def view_scene(
     moment."""
     tracks = np.array([[pose.position for pose in swarm.poses(t).values()] for t in times])
     view = best_view(city, tracks, width / height)
-    picture, depth = shade(city, view, width * _SUPERSAMPLING, height * _SUPERSAMPLING)
-    picture = picture.reshape(height, _SUPERSAMPLING, width, _SUPERSAMPLING, 3).mean(axis=(1, 3))
+    image, depth = shade(city, view, width * _SUPERSAMPLING, height * _SUPERSAMPLING)
+    image = image.reshape(height, _SUPERSAMPLING, width, _SUPERSAMPLING, 3).mean(axis=(1, 3))
     figure = Figure(figsize=(width / 100, height / 100), dpi=100)
     ax = figure.add_axes((0, 0, 1, 1))
     extent = (-view.half[0], view.half[0], -view.half[1], view.half[1])
-    ax.imshow(np.clip(picture, 0, 1), origin="lower", extent=extent, interpolation="antialiased")
+    ax.imshow(np.clip(image, 0, 1), origin="lower", extent=extent, interpolation="antialiased")
     drawn = _Picture(ax, view, depth)
     legend = drawn.paths(paths, swarm.poses(time))
     level = float(tracks[..., 2].min() - 10)

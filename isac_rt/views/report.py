@@ -68,10 +68,10 @@ def walls(dataset: xr.Dataset, city: CityMesh) -> pd.DataFrame:
                 "all": len(mine),
             }
         )
-    found = pd.DataFrame(rows)
+    table = pd.DataFrame(rows)
     if rows:
-        found = found.sort_values("all", ascending=False, kind="stable").drop(columns="all")
-    return found
+        table = table.sort_values("all", ascending=False, kind="stable").drop(columns="all")
+    return table
 
 
 def _words(city: CityMesh, face: int) -> str:
@@ -118,17 +118,17 @@ def _scene(dataset: xr.Dataset, city: CityMesh | None) -> tuple[str, str]:
 
 def wall_table(dataset: xr.Dataset, city: CityMesh) -> Table:
     """The surfaces of the city that most detections came from, as `walls` finds them."""
-    found = walls(dataset, city).head(MOST_WALLS)
-    found = found.loc[:, [found[name].astype(bool).any() for name in found]]  # what occurs
-    return Table([*found.columns], [[number(v) for v in row] for row in found.values.tolist()])
+    table = walls(dataset, city).head(MOST_WALLS)
+    table = table.loc[:, [table[name].astype(bool).any() for name in table]]  # what occurs
+    return Table([*table.columns], [[number(v) for v in row] for row in table.values.tolist()])
 
 
 def _embedded(pictures: Sequence[Path]) -> dict[str, list[str]]:
     """The pictures in base 64 by `FIGURES`."""
     out: dict[str, list[str]] = {key: [] for key in (*FIGURES, "other")}
-    for picture in pictures:
-        key = next((key for key in FIGURES if f"{picture.stem}_".startswith(f"{key}_")), "other")
-        out[key].append(base64.b64encode(picture.read_bytes()).decode())
+    for file in pictures:
+        key = next((key for key in FIGURES if f"{file.stem}_".startswith(f"{key}_")), "other")
+        out[key].append(base64.b64encode(file.read_bytes()).decode())
     return out
 
 

@@ -73,8 +73,8 @@ def link_name(dataset: xr.Dataset, observer: int) -> str:
 
 def range_words(dataset: xr.Dataset, observer: int) -> str:
     """Return the axis label of an observer's ranges: those of echoes are one-way."""
-    own = dataset.transmitter.values[observer] == dataset.receiver.values[observer]
-    return "range [m]" if own else "path length [m]"
+    monostatic = dataset.transmitter.values[observer] == dataset.receiver.values[observer]
+    return "range [m]" if monostatic else "path length [m]"
 
 
 def moment(dataset: xr.Dataset, snapshot: int) -> tuple[int, int]:
@@ -92,7 +92,7 @@ def labelled(ax: Axes, x: str, y: str, title: str = "", **legend: Any) -> Axes:
     figure = ax.get_figure(root=True)
     assert figure is not None
     names = ax.get_legend_handles_labels()[1]
-    legends = [other.get_legend() for other in figure.axes]
+    legends = [axes.get_legend() for axes in figure.axes]
     if not names or names in [[t.get_text() for t in old.get_texts()] for old in legends if old]:
         ax.set_title(title)
         return ax

@@ -203,10 +203,10 @@ def _sets(summary: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, A
     """(link, set of receivers, figures) where several sets received the same samples."""
     sets = {OWN: summary, **summary.get("compared", {})}
     for link in summary["links"]:
-        for name, one in sets.items():
+        for name, figures in sets.items():
             known = name in summary["timing_s"].get("by_set", {})
-            if known and "tracked_rate" in one["links"][link]:
-                yield link, name, one["links"][link]
+            if known and "tracked_rate" in figures["links"][link]:
+                yield link, name, figures["links"][link]
 
 
 _CITY = ("ghost", "specular", "diffuse")
@@ -218,18 +218,18 @@ def city_costs(summary: Mapping[str, Any]) -> Table:
     the city causes; no rows where none are compared."""
     causes = {"Masked": "masked", "Clutter": "clutter", "Not decoded": "erased"}
     rows = []
-    for link, name, one in _sets(summary):
-        noise_only, hits = one["bounds"]["clutter_free"], one["hit_rate"]
+    for link, name, figures in _sets(summary):
+        noise_only, hits = figures["bounds"]["clutter_free"], figures["hit_rate"]
         if hits is None or noise_only is None:
             continue
         values = (
-            one["in_view"],
+            figures["in_view"],
             hits,
             noise_only,
             round(noise_only - hits, 3),
-            *(one["losses"][cause] for cause in causes.values()),
-            sum(one["false_tracks"][kind] or 0.0 for kind in _CITY),
-            one["ser_delay"],
+            *(figures["losses"][cause] for cause in causes.values()),
+            sum(figures["false_tracks"][kind] or 0.0 for kind in _CITY),
+            figures["ser_delay"],
         )
         rows.append((link_words(link), name, *map(number, values)))
     titles = ("In view", "Found", "Noise only", "City loss", *causes)
@@ -258,8 +258,8 @@ _OUTSIDE = ("out_of_view", "beyond_range", "too_near", "too_fast")
 def _filled(table: Table) -> Table:
     """A table without its columns of dashes alone."""
     columns = zip(table.columns, *table.rows, strict=True)
-    kept = [column for column in columns if set(column[1:]) != {DASH}]
-    titles, *rows = zip(*kept, strict=True)
+    filled = [column for column in columns if set(column[1:]) != {DASH}]
+    titles, *rows = zip(*filled, strict=True)
     return Table(titles, rows)
 
 

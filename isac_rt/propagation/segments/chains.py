@@ -101,8 +101,8 @@ class Search:
             return self._pool([self._sent(pose.position, n) for n in self._window(0)])
         time_sample = int(np.clip(np.rint(flight.number(time)), 0, len(flight.time_samples) - 1))
         if name not in self._pools or self._pools[name][0] != time_sample:
-            found = [self._time_sample(name, flight, n) for n in self._window(time_sample)]
-            self._pools[name] = time_sample, self._pool(found)
+            sequences = [self._time_sample(name, flight, n) for n in self._window(time_sample)]
+            self._pools[name] = time_sample, self._pool(sequences)
             far = SAMPLES_PER_BATCH + AROUND
             for key in [k for k in self._kept if k[0] == name and abs(k[1] - time_sample) > far]:
                 del self._kept[key]

@@ -54,7 +54,7 @@ def _beside(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find positions (K, 3) within a margin of faces (F,): numbers of both."""
     near = np.abs(normals @ positions.T - offsets[:, None]) < most
-    face, place = np.nonzero(near)
-    here = positions[place]
+    face, point = np.nonzero(near)
+    here = positions[point]
     inside = ((low[face] - most < here) & (here < high[face] + most)).all(axis=1)
-    return place[inside], face[inside]
+    return point[inside], face[inside]

@@ -162,13 +162,13 @@ def near(
         for *ends, far in zip(sources, sinks, aside, strict=True)
     ]
     path = np.repeat(np.arange(len(sources)), [edges.block[block].size for block in blocks])
-    some = edges.block[np.concatenate(blocks)].ravel()
-    ball = edges.half[some] + aside[path]
-    inside = (some >= 0) & (_off(edges.middle[some], sources[path], sinks[path]) <= ball)
-    order = np.lexsort([some[inside], path[inside]])
-    path, some = path[inside][order], some[inside][order]
-    start, size = edges.start[some], 2 * edges.half[some]
-    unit, both = edges.span[some] / size[:, None], (sources[path], sinks[path])
+    edge = edges.block[np.concatenate(blocks)].ravel()
+    ball = edges.half[edge] + aside[path]
+    inside = (edge >= 0) & (_off(edges.middle[edge], sources[path], sinks[path]) <= ball)
+    order = np.lexsort([edge[inside], path[inside]])
+    path, edge = path[inside][order], edge[inside][order]
+    start, size = edges.start[edge], 2 * edges.half[edge]
+    unit, both = edges.span[edge] / size[:, None], (sources[path], sinks[path])
     foot = [_dot(end - start, unit) for end in both]
     across = [end - start - at[:, None] * unit for end, at in zip(both, foot, strict=True)]
     off = [np.sqrt(_dot(line, line)) for line in across]
@@ -179,7 +179,7 @@ def near(
     normal = np.cross(unit, both[1] - both[0]) / length[path, None]
     sine = np.linalg.norm(normal, axis=1)
     # a silhouette: both faces lie on one side of the plane of the path and the edge
-    side = ((edges.wings[some] - start[:, None]) * normal[:, None]).sum(axis=2)
+    side = ((edges.wings[edge] - start[:, None]) * normal[:, None]).sum(axis=2)
     true = (off_sum >= 1e-9) & (detour <= reach[path]) & (sine >= 1e-6) & (side.prod(axis=1) > 0)
     which = np.flatnonzero(true)
     which = which[np.lexsort([detour[which], path[which]])]

@@ -163,8 +163,8 @@ class Images:
         every = np.concatenate([np.zeros((0, self._depth + 2), np.int64), *rows])
         bounces = (every[:, 2:] >= 0).sum(axis=1)
         for count in range(1, self._depth + 1):
-            some = every[(bounces == count) & ((count > 1) | (every[:, 1] < 0))]
-            parts.append(self._candidates(some[:, 0], some[:, 1], some[:, 2 : 2 + count], motion))
+            pick = every[(bounces == count) & ((count > 1) | (every[:, 1] < 0))]
+            parts.append(self._candidates(pick[:, 0], pick[:, 1], pick[:, 2 : 2 + count], motion))
         clear = self._clear(parts)
         return self._settled(parts, clear, pairs)
 
@@ -177,12 +177,12 @@ class Images:
         ends = np.array([local[name].position for name in names])
         if self._depth > 1:
             ends = np.concatenate([ends, position + PROBES_M])
-        found = reflected(chains[start], self._mirrors, self._depth, position, ends)
-        end = found[:, 0]
+        images = reflected(chains[start], self._mirrors, self._depth, position, ends)
+        end = images[:, 0]
         beside = np.where(end < len(names), -1, end - len(names))
         end = np.where(end < len(names), end, names.index(start))
         pair = list(chains).index(start) * len(names) + end
-        return np.column_stack([pair, beside, found[:, 1:]])
+        return np.column_stack([pair, beside, images[:, 1:]])
 
     def _candidates(
         self, pair: np.ndarray, beside: np.ndarray, faces: np.ndarray, motion: np.ndarray
@@ -202,8 +202,8 @@ class Images:
         distance = np.linalg.norm(segments.points - points, axis=2).max(axis=1, initial=0.0)
         stops = np.concatenate([start.position[:, None], points, tip[:, None]], axis=1)
         keep = np.flatnonzero(distance < SLACK + STRETCH * segments.length)
-        found = segments.select(keep)
-        return _Candidates(pair[keep], faces[keep], normals[keep], found, stops[keep])
+        chosen = segments.select(keep)
+        return _Candidates(pair[keep], faces[keep], normals[keep], chosen, stops[keep])
 
     def _clear(self, parts: list[_Candidates]) -> list[np.ndarray]:
         """(K,) of each part, whether nothing stands in the way."""
@@ -293,12 +293,12 @@ def reflected(
 def _faces_at(mirrors: Mirrors, plane: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(K,) the first faces of planes that hold points (K, 3) of them; -1 where there is none."""
     out, none = np.full(len(plane), -1), len(mirrors.face)
-    for one in np.unique(plane):
-        on = plane == one
-        at, faces = points[on], slice(*mirrors.first[one : one + 2])
-        flat = np.column_stack([at[:, mirrors.axes[one, :2]], np.ones(len(at))])
+    for number in np.unique(plane):
+        on = plane == number
+        at, faces = points[on], slice(*mirrors.first[number : number + 2])
+        flat = np.column_stack([at[:, mirrors.axes[number, :2]], np.ones(len(at))])
         inside = (np.einsum("fsc,kc->kfs", mirrors.sides[faces], flat) >= -WIDER).all(axis=2)
-        inside &= ((mirrors.low[one] <= at) & (at <= mirrors.high[one])).all(axis=1)[:, None]
+        inside &= ((mirrors.low[number] <= at) & (at <= mirrors.high[number])).all(axis=1)[:, None]
         first = np.where(inside, mirrors.face[faces], none).min(axis=1)
         out[on] = np.where(first < none, first, -1)
     return out

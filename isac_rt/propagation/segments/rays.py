@@ -118,13 +118,13 @@ class LosTest:
         facet, out = _columns(points, normals), np.empty((len(positions), len(points)), bool)
         for first in range(0, len(positions) if len(points) else 0, max(CHUNK // width, 1)):
             part = slice(first, first + max(CHUNK // width, 1))
-            some = out[part]
-            row, view = dr.arange(mi.UInt32, some.size), _columns(positions[part])
+            chunk = out[part]
+            row, view = dr.arange(mi.UInt32, chunk.size), _columns(positions[part])
             number = row // dr.opaque(mi.UInt32, width)
             at = [dr.gather(mi.Float64, axis, number) for axis in view]
             column = row - number * dr.opaque(mi.UInt32, width)
             here = [dr.gather(mi.Float64, axis, column) for axis in facet]
-            some[:] = ~computed(self._blocked(at, here)).reshape(some.shape)
+            chunk[:] = ~computed(self._blocked(at, here)).reshape(chunk.shape)
         return out
 
     def _blocked(self, position: list[mi.Float64], facet: list[mi.Float64]) -> mi.Bool:

@@ -42,8 +42,8 @@ class SegmentSet:
     @classmethod
     def joined(cls, sets: list[SegmentSet]) -> SegmentSet:
         """All segments of some sets."""
-        amplitude, segments, faces, planes = zip(*(vars(one).values() for one in sets), strict=True)
-        columns = map(np.concatenate, zip(*(vars(one).values() for one in segments), strict=True))
+        amplitude, segments, faces, planes = zip(*(vars(s).values() for s in sets), strict=True)
+        columns = map(np.concatenate, zip(*(vars(s).values() for s in segments), strict=True))
         every = Segments(*columns)
         return cls(np.concatenate(amplitude), every, np.concatenate(faces), np.concatenate(planes))
 

@@ -160,8 +160,8 @@ class _Descent:
 
     def _by_amplitude(self, sums: np.ndarray) -> np.ndarray:
         """Sums (..., L_tx, L_rx) added up for each amplitude of a path."""
-        each = sums.sum(axis=-1)
-        return each if self.count > 1 else each.sum(axis=-1, keepdims=True)
+        norms = sums.sum(axis=-1)
+        return norms if self.count > 1 else norms.sum(axis=-1, keepdims=True)
 
     def _amplitudes(self) -> np.ndarray:
         """(K, L_tx) amplitudes of all paths."""
@@ -171,8 +171,8 @@ class _Descent:
     def amplitudes(self) -> None:
         """Give the free paths the amplitudes of least squares where they are."""
         of, at = np.nonzero(self.coupled)
-        kept = (at < of) | (at >= self.free)
-        of, at = of[kept], at[kept]
+        used = (at < of) | (at >= self.free)
+        of, at = of[used], at[used]
         alone = self.weights._replace(factors=self.weights.factors[:1])
         sums = cross_sums(self.tones, np.column_stack([of, at]), alone, 1)[:, 0, 0]
         gram = np.zeros((self.count, self.free, self.free), complex)
@@ -184,8 +184,8 @@ class _Descent:
                 right[k] -= self.paths[j].amplitude * both
             else:
                 gram[:, k, j], gram[:, j, k] = both, both.conj()
-        found = [np.linalg.lstsq(g, r, rcond=1e-9)[0] for g, r in zip(gram, right.T, strict=True)]
-        for k, amplitude in enumerate(np.array(found).T):
+        solved = [np.linalg.lstsq(g, r, rcond=1e-9)[0] for g, r in zip(gram, right.T, strict=True)]
+        for k, amplitude in enumerate(np.array(solved).T):
             self.paths[k] = replace(self.paths[k], amplitude=amplitude)
 
     def step(self, active: np.ndarray) -> np.ndarray:
@@ -264,8 +264,8 @@ class _Descent:
         a cluster, and the others."""
         of, at = np.nonzero(self.coupled)
         acts = np.isin(np.arange(len(self.paths)), active)
-        kept = acts[of] & ((at < of) | ~acts[at])
-        of, at = of[kept], at[kept]
+        used = acts[of] & ((at < of) | ~acts[at])
+        of, at = of[used], at[used]
         group = np.append(self.group, np.full(len(self.paths) - self.free, -1))
         same, pairs = group[of] == group[at], np.column_stack([of, at])
         return pairs[same], pairs[~same]
@@ -353,13 +353,13 @@ def energy(known: Known, paths: Sequence[JointPath]) -> float:
     wave = np.array([np.broadcast_to(p.amplitude, num_tx) for p in paths])
     of, at = np.tril_indices(len(paths), -1)
     both = cross_sums(tones, np.column_stack([of, at]), weights, 1)[:, 0, 0].sum(axis=-1)
-    own = own_sums(float(known.waveform.num_samples), weights, 1)[0, 0, :, 0]
-    alone = (np.abs(wave) ** 2 @ own).sum() * known.antennas.num_rx
+    sums = own_sums(float(known.waveform.num_samples), weights, 1)[0, 0, :, 0]
+    alone = (np.abs(wave) ** 2 @ sums).sum() * known.antennas.num_rx
     return float(alone + 2 * (wave[of].conj() * wave[at] * both).sum().real)
 
 
 def residual_channels(
-    moments: Moments, found: Fit, beside: Sequence[JointPath], offsets: np.ndarray
+    moments: Moments, fitted: Fit, beside: Sequence[JointPath], offsets: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Return what the paths of a fit leave at some places, channel by channel.
 
@@ -375,20 +375,20 @@ def residual_channels(
         the root of their samples
     counts : samples per amplitude of a path
     """
-    known, num = moments.known, len(found.paths)
+    known, num = moments.known, len(fitted.paths)
     w, num_tx = known.waveform, known.antennas.num_tx
     # a bin is one turn per frame
     back = np.exp(-2j * np.pi * offsets[:, None, None] * known.sampled_times / w.frame_duration)
     weights = Weights.by_antenna(known, back)
     sent = np.array([mine.sum() for mine in known.sent_by]) * w.num_samples
     counts = (sent if known.passes == 1 else np.array([sent.sum()])) * known.antennas.num_rx
-    power = np.array([(np.abs(p.amplitude) ** 2 * counts).sum() for p in found.paths])
-    share = shared(known, cell_positions(known, found.paths), cell_positions(known, beside))
+    power = np.array([(np.abs(p.amplitude) ** 2 * counts).sum() for p in fitted.paths])
+    share = shared(known, cell_positions(known, fitted.paths), cell_positions(known, beside))
     at, of = np.nonzero(~ignored(share, power / moments.noise))
-    tones = Tones.of(known, [*found.paths, *beside])[0]
+    tones = Tones.of(known, [*fitted.paths, *beside])[0]
     left = moments.of(tones.select(slice(num, None)), weights)[:, 0]
     sums = cross_sums(tones, np.column_stack([num + at, of]), weights, 1)[:, 0]
     for i, j, both in zip(at, of, sums, strict=True):
-        left[i] -= np.broadcast_to(found.paths[j].amplitude, num_tx)[:, None] * both
+        left[i] -= np.broadcast_to(fitted.paths[j].amplitude, num_tx)[:, None] * both
     for channels in left:
         yield channels / np.sqrt(sent)[:, None], counts

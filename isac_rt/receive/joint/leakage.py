@@ -97,20 +97,20 @@ def _sums(samples: np.ndarray, known: Known, delay: float, shapes: Shapes) -> np
     for group, (mine, schedule) in enumerate(zip(samples, known.schedule, strict=True)):
         factors = shapes(_times(known, group))
         design = (_tones(known, delay, group)[:, None] * factors).conj().astype(np.complex64)
-        each = mine.swapaxes(0, 1) @ design.swapaxes(1, 2)  # chirp, receiver, factor
+        products = mine.swapaxes(0, 1) @ design.swapaxes(1, 2)  # chirp, receiver, factor
         sent = schedule == np.arange(known.antennas.num_tx)[:, None]
-        out = out + np.einsum("ap,prq->arq", sent, each.astype(complex))
+        out = out + np.einsum("ap,prq->arq", sent, products.astype(complex))
     return np.asarray(out)
 
 
 def _fit(known: Known, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(L_tx, L_rx) amplitude and phi of every pair, by Gauss-Newton from phi = 0."""
     x = [_times(known, group) for group in range(len(known.schedule))]
-    own = [
+    times = [
         np.concatenate([a[s == tx] for a, s in zip(x, known.schedule, strict=True)])
         for tx in range(known.antennas.num_tx)
     ]
-    count, first, second = np.array([[(a**q).sum() for a in own] for q in range(3)])[..., None]
+    count, first, second = np.array([[(a**q).sum() for a in times] for q in range(3)])[..., None]
     phi = np.zeros(sums.shape[:2])
     for _ in range(ITERATIONS):
         back = _series(-phi)

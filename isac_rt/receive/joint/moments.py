@@ -96,10 +96,10 @@ class Moments:
         are taken out, n from the chirp's middle."""
         shape = len(tones.cycles), 2, len(weights.factors), weights.num_sums, tones.delay.shape[1]
         out, size = np.zeros(shape, complex), self._samples.shape[-1]
-        late = size // 2 - (size - 1) / 2
+        shift = size // 2 - (size - 1) / 2
         factors = weights.factors * self.known.phases.conj()
         turned = weights._replace(factors=factors)
-        fill_sums(self.spectrum.view(np.float32), tones, turned, late, _kernel(), out)
+        fill_sums(self.spectrum.view(np.float32), tones, turned, shift, _kernel(), out)
         return out
 
 

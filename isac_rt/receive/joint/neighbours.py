@@ -62,25 +62,25 @@ def refine_jointly(moments: Moments, detections: Detections) -> tuple[Detections
     if not order.size:
         return d, np.full(len(d), np.nan)
     start = [_path(known, d, i) for i in order]
-    found = fit(moments, start)
+    fitted = fit(moments, start)
     # two detections of one path run away from each other: neither has an answer of its own
-    near = [_near(known, p, s) for p, s in zip(found.paths, start, strict=True)]
+    near = [_near(known, p, s) for p, s in zip(fitted.paths, start, strict=True)]
     group = _clusters(known, start)
     settled = ~np.isin(group, group[~np.array(near)])
     probed = {0} if d.is_reference[order[0]] else set()
-    found, parent = _with_neighbours(moments, found, settled, probed)
+    fitted, parent = _with_neighbours(moments, fitted, settled, probed)
     settled = np.append(settled, np.ones(len(parent), bool))
-    return _merged(known, d, order, _widened(moments, found), parent, settled)
+    return _merged(known, d, order, _widened(moments, fitted), parent, settled)
 
 
-def _widened(moments: Moments, found: Fit) -> list[JointPath]:
+def _widened(moments: Moments, fitted: Fit) -> list[JointPath]:
     """The paths of a fit, with deviations by the power that is left about each: noise, and echoes
     that nothing found. They grow with the root of what the channels hold over it where the path
     was taken out: what no path explains may have moved it so far."""
-    known, paths, noise = moments.known, found.paths, found.left / moments.size
+    known, paths, noise = moments.known, fitted.paths, fitted.left / moments.size
 
     def left(beside: Sequence[JointPath], offsets: np.ndarray) -> np.ndarray:
-        around = residual_channels(moments, found, beside, offsets)
+        around = residual_channels(moments, fitted, beside, offsets)
         power = np.array([(np.abs(c) ** 2).mean(axis=(1, 2)) for c, _ in around])
         return power.reshape(len(paths), -1) / noise
 
@@ -97,60 +97,60 @@ def _widened(moments: Moments, found: Fit) -> list[JointPath]:
 
 
 def _with_neighbours(
-    moments: Moments, found: Fit, settled: np.ndarray, probed: Set[int]
+    moments: Moments, fitted: Fit, settled: np.ndarray, probed: Set[int]
 ) -> tuple[Fit, list[int]]:
     """A fit with the paths that are found beside its strongest settled ones behind, and beside
     which path each was; beside those `probed` they are sought off in delay too. Only what is close
     to a new path is fitted again."""
-    parent = list(range(len(found.paths)))
-    power = np.array([float((np.abs(p.amplitude) ** 2).mean()) for p in found.paths])
+    parent = list(range(len(fitted.paths)))
+    power = np.array([float((np.abs(p.amplitude) ** 2).mean()) for p in fitted.paths])
     searched = np.flatnonzero(settled)[np.argsort(-power[settled], kind="stable")][:MAX_SEARCHED]
     stale, spent = set(searched.tolist()), 0
     best: dict[int, tuple[float, int, JointPath]] = {}
     while spent < MAX_NEIGHBOURS:
         for k in stale:
             delays = PROBED_CELLS if k in probed else ()
-            if (one := _further_path(moments, found, [k], delays)) is not None:
-                best[k] = one
+            if (further := _further_path(moments, fitted, [k], delays)) is not None:
+                best[k] = further
         stale = set()
         if not best:
             break
         surest = max(best, key=lambda k: best[k][0])
-        trial = _joined(moments, found, surest, best.pop(surest)[2], settled)
+        trial = _joined(moments, fitted, surest, best.pop(surest)[2], settled)
         spent += 1
         if trial is None:
             continue
-        found = trial
+        fitted = trial
         parent.append(parent[surest])
         settled = np.append(settled, True)
         # what was found elsewhere may have been a sidelobe of the new one
-        stale = {surest, *best, len(found.paths) - 1}
+        stale = {surest, *best, len(fitted.paths) - 1}
         best = {}
-    return found, parent[power.size :]
+    return fitted, parent[power.size :]
 
 
 def _joined(
-    moments: Moments, found: Fit, beside: int, other: JointPath, settled: np.ndarray
+    moments: Moments, fitted: Fit, beside: int, second: JointPath, settled: np.ndarray
 ) -> Fit | None:
     """A fit with another path behind, for which those close to it are fitted again; None where it
     does not settle."""
     known = moments.known
-    group = _clusters(known, [*found.paths, other])
+    group = _clusters(known, [*fitted.paths, second])
     mine = np.flatnonzero((group[:-1] == group[-1]) & settled)
     mine = np.union1d(mine, [beside])
-    rest = np.setdiff1d(np.arange(len(found.paths)), mine)
-    members = [found.paths[k] for k in mine]
+    rest = np.setdiff1d(np.arange(len(fitted.paths)), mine)
+    members = [fitted.paths[k] for k in mine]
     trial = fit(
         moments,
-        [*members, other],
+        [*members, second],
         iterations=MOST_STEPS,
-        fixed=[found.paths[k] for k in rest],
-        energy=found.left + energy(known, members),
+        fixed=[fitted.paths[k] for k in rest],
+        energy=fitted.left + energy(known, members),
     )
     at = int(np.searchsorted(mine, beside))
-    if trial.left > found.left or not _credible(known, trial.paths, [*members, other], at):
+    if trial.left > fitted.left or not _credible(known, trial.paths, [*members, second], at):
         return None
-    paths = [*found.paths, trial.paths[-1]]
+    paths = [*fitted.paths, trial.paths[-1]]
     for k, path in zip(mine, trial.paths, strict=False):
         paths[k] = path
     return Fit(paths, trial.left)
@@ -180,13 +180,13 @@ def separate(moments: Moments, reference: Detections) -> tuple[Detections, np.nd
         return None
     known = moments.known
     start = _path(known, reference, 0)
-    one = fit(moments, [start])
-    near = _near(known, one.paths[0], start)
-    found = _further_path(moments, one, [0], PROBED_CELLS) if near else None
-    if found is None:
+    single = fit(moments, [start])
+    near = _near(known, single.paths[0], start)
+    pair = _further_path(moments, single, [0], PROBED_CELLS) if near else None
+    if pair is None:
         return None
-    trial = fit(moments, [*one.paths, found[2]], iterations=MOST_STEPS)
-    if trial.left > one.left or not _credible(known, trial.paths, [*one.paths, found[2]], 0):
+    trial = fit(moments, [*single.paths, pair[2]], iterations=MOST_STEPS)
+    if trial.left > single.left or not _credible(known, trial.paths, [*single.paths, pair[2]], 0):
         return None
     return _merged(
         known, reference, np.zeros(1, int), _widened(moments, trial), [0], np.ones(2, bool)
@@ -223,7 +223,7 @@ def _credible(known: Known, paths: list[JointPath], before: list[JointPath], bes
 
 
 def _further_path(
-    moments: Moments, found: Fit, which: list[int], delays: tuple[float, ...] = ()
+    moments: Moments, fitted: Fit, which: list[int], delays: tuple[float, ...] = ()
 ) -> tuple[float, int, JointPath] | None:
     """The surest path that the residual of a fit holds about some of its paths, with its power over
     the noise and the number of the path that it is beside; sought at that path's delay and at so
@@ -233,16 +233,16 @@ def _further_path(
     axis = np.linspace(-limit, limit, DIRECTIONS)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     grid = grid[(grid**2).sum(axis=1) < 0.98]
-    noise, sums = found.left / moments.size, 1 if known.passes == 2 else known.antennas.num_tx
-    own = [found.paths[k] for k in which]
-    beside = [*own, *(_probe(known, p, cells) for p in own for cells in delays)]
+    noise, sums = fitted.left / moments.size, 1 if known.passes == 2 else known.antennas.num_tx
+    near_paths = [fitted.paths[k] for k in which]
+    beside = [*near_paths, *(_probe(known, p, cells) for p in near_paths for cells in delays)]
     parents = [*which, *(k for k in which for _ in delays)]
     tried = len(grid) * len(DOPPLER_OFFSETS) * MAX_SEARCHED * (1 + len(delays))
     level = gammainccinv(sums, FALSE_RATE / tried)
     best: tuple[float, int, JointPath] | None = None
-    around = residual_channels(moments, found, beside, DOPPLER_OFFSETS)
+    around = residual_channels(moments, fitted, beside, DOPPLER_OFFSETS)
     for k, path, (channels, counts) in zip(parents, beside, around, strict=True):
-        strength = float((np.abs(found.paths[k].amplitude) ** 2 * counts).sum()) / noise
+        strength = float((np.abs(fitted.paths[k].amplitude) ** 2 * counts).sum()) / noise
         least = max(level, 10 ** (-WEAKEST_DB / 10) * strength, 0.0 if best is None else best[0])
         if (np.abs(channels) ** 2).sum(axis=(1, 2)).max() <= least * noise:
             continue  # no beam holds more than all channels
@@ -269,8 +269,8 @@ def _beams(known: Known, path: JointPath, channels: np.ndarray, grid: np.ndarray
     j_omega = 2j * np.pi * known.waveform.effective_carrier
 
     def steer(positions: np.ndarray) -> np.ndarray:
-        own = element_delays(positions, path.direction, radius)[0]
-        return np.exp(j_omega * (element_delays(positions, grid, radius)[0] - own))
+        delays = element_delays(positions, path.direction, radius)[0]
+        return np.exp(j_omega * (element_delays(positions, grid, radius)[0] - delays))
 
     beams = channels @ steer(a.rx_positions).conj().T  # (offset, L_tx, G)
     if known.passes == 2:
@@ -292,7 +292,7 @@ def _merged(
     old, scale = len(d), known.metres
     source = np.append(np.arange(old), order[parent])
     rows = np.append(order, np.arange(old, source.size))[settled]
-    paths = [p for p, kept in zip(paths, settled, strict=True) if kept]
+    paths = [p for p, is_settled in zip(paths, settled, strict=True) if is_settled]
     power = np.full(source.size, np.nan)
     power[rows] = [float((np.abs(p.amplitude) ** 2).mean()) for p in paths]
     v = {name: value[source] for name, value in vars(d).items()}
