@@ -36,6 +36,7 @@ def plan(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         .. r-1 (real, imaginary)
     order : (size,) int64, the row that holds output k
     """
+    # factors: 5 and 3, then 8 as often as possible with some 4, or 2
     left, radices = size, []
     for r in (5, 3):
         while left % r == 0:
@@ -52,6 +53,7 @@ def plan(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         size,
         np.arange(size),
     )
+    # twiddles stage by stage; the digit-reversed place of each output
     for r in radices:
         i, k = np.arange(length // r)[:, None], np.arange(1, r)[None, :]
         parts.append(np.exp(2j * np.pi * i * k / length).astype(np.complex64).ravel())

@@ -40,6 +40,7 @@ def line_bounds(maps, channels, spectra, out):
             for e in range(count):
                 at = channels[t, e] * width + 2 * first
                 _load_channels(flat, at, t * line + 2 * LANES * e, channels_read)
+        # |sum of channels times weights|^2, added over the transmitters' lines; the largest counts
         largest = zero
         for g in range(0, len(spectra), 2):
             one, other = zero, zero
@@ -75,6 +76,7 @@ def search_directions(along_x, along_z, phasors_z, phasors_x, inside, scale, pea
             for j in range(0, size, LANES):
                 total = zero
                 for t in range(looks):
+                    # spectra along x times phasors of their places along z, and the reverse
                     re, im = zero, zero
                     for k in range(along_x.shape[2]):
                         a, b = splat(along_x[s, t, k, i].real), splat(along_x[s, t, k, i].imag)
@@ -88,6 +90,7 @@ def search_directions(along_x, along_z, phasors_z, phasors_x, inside, scale, pea
                     total = total + (re * re + im * im)
                 at = i * size + j
                 store(power, at, total * load(each, norm + at))
+        # the largest inside the field of view, between its neighbours on both axes
         best = _largest(power, inside)
         peak[s] = power[best]
         for axis, step in enumerate((size, 1)):

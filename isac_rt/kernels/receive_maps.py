@@ -34,6 +34,7 @@ def make_maps(flat, shape, ends, index, factors, workspace, maps, buffer, power)
         for first in range(0, num_rows, ROWS):
             last = min(first + ROWS, num_rows)
             for tx in range(ends.size - 1):
+                # bins of an antenna's chirps, block by block, three rows at once
                 sent = index[ends[tx] : ends[tx + 1]]
                 for block in range(factors.shape[0]):
                     at = (block * factors.shape[1] + ends[tx]) * 2 * PART
@@ -43,6 +44,7 @@ def make_maps(flat, shape, ends, index, factors, workspace, maps, buffer, power)
                         _three_rows(
                             samples, rows, sent, operators, at, workspace, first, (size, block)
                         )
+                # bins in order, and the power added
                 lines = maps[tx, rx, first:last] if maps.shape[0] else buffer[: last - first]
                 for i in range(last - first):
                     made = workspace[4 * i * size : 4 * (i + 1) * size]
@@ -85,10 +87,10 @@ def _keep_both(workspace, row, part, ax, bx, ay, by):
     size, block = part
     begin = 4 * row * size + 2 * block * PART
     end = 4 * (row + 1) * size - 2 * (block + 1) * PART
-    re, im = ax - by, bx + ay
+    re, im = ax - by, bx + ay  # (a + j b)(x + j y)
     store(workspace, begin, zip_low(re, im))
     store(workspace, begin + PART, zip_high(re, im))
-    re, im = backwards(ax + by), backwards(ay - bx)
+    re, im = backwards(ax + by), backwards(ay - bx)  # (a - j b)(x + j y)
     store(workspace, end, zip_low(re, im))
     store(workspace, end + PART, zip_high(re, im))
 

@@ -294,6 +294,7 @@ def below_noise_paths(
     centre : mean of x^2 over the samples
     steering : makes the `steer` of paths (K,) with delays (K,) [half chirps]
     """
+    # paths of one link and offset together, by beat, padded to a multiple of sixteen
     w, t = waveform, tones
     path, offset = sources
     lag = offset * w.group_spacing
@@ -311,6 +312,7 @@ def below_noise_paths(
     real = np.concatenate([np.arange(f) < c for c, f in zip(counts, full, strict=True)])
     ends = np.cumsum(full)
     groups = np.stack([t.link[path[starts]], offset[starts], ends - full, ends - full + counts], 1)
+    # phase at mid-chirp, with the mean of the quadratic term, and its derivatives
     path, lag = path[index], lag[index]
     delay, rate, accel = t.delay[path] - lag, t.rate[path], t.accel[path]
     sent = carrier - w.slope * delay
@@ -320,6 +322,7 @@ def below_noise_paths(
     element = delay + extra
     factor = t.factor[path] * t.tx_gain[path].T if t.tx_gain.size else t.factor[path]
     cycles = element * (carrier - w.slope / 2 * element) + bow * centre
+    # place on the grid and its rate, and the line below in the middle of each part of the frame
     position = (w.slope * delay + rate * sent) * ts * size
     drift = w.slope * rate * ts * size
     spacing = 1 / (w.slope * ts * size * LINES)

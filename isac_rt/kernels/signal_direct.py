@@ -103,17 +103,20 @@ def _tone(workspace, half, amplitude, phase, frequency, quadratic):
     what is left out is the square of the last term, 1e-8 at 15 m/s.
     """
     sums, starts, lane, offsets = workspace
+    # exp(frequency i + quadratic i^2) within 16 samples, and i times it
     within = load(offsets, 0)
     _phasor(lane, 0, within * (splat(frequency) + within * splat(quadratic)), 1.0 + 0.0j)
     lr, li, offset = load(lane, 0), load(lane, 16), narrow(within)
     mr, mi = offset * lr, offset * li
     blocks, curvature = sums.shape[0] // 32, np.float32(4 * np.pi * quadratic)
     for first in range(0, blocks, LANES):
+        # of 16 middles X: the phasor, and j 4 pi quadratic X times it
         x = load(offsets, 16) + splat(first * LANES - half)
         _phasor(starts, 0, splat(phase) + x * (splat(frequency) + x * splat(quadratic)), amplitude)
         cross = narrow(x) * splat(curvature)
         store(starts, 32, splat(np.float32(0)) - cross * load(starts, 16))
         store(starts, 48, cross * load(starts, 0))
+        # sums of the products
         for i in range(min(LANES, blocks - first)):
             at = 32 * (first + i)
             pr, pi, qr, qi = (
@@ -232,6 +235,7 @@ def sum_paths(alone, w, half, m, r, p):
         k, source = path[i], m - offset[i]
         if source < 0 or source >= groups or time < t.begin[k] or time >= t.end[k]:
             continue
+        # delay of the centroid, with data; amplitude behind the filter; then the element's tone
         q = t.link[k]
         tau = (
             t.symbol_delay[q, source, p]

@@ -272,6 +272,7 @@ def _prepare(work, cells, b, block, w, g, time, symbol, send, antenna):
         load(table, at + 32),
         load(table, at + (_FIELDS + antenna) * 16),
     )
+    # delay of the centroid and of the transmit element, at mid-chirp
     tau = delay + splat(symbol) + (rate + accel * splat(time / 2)) * splat(time)
     element = tau + extra
     step, a = (rate + accel * splat(time)) * splat(ts), accel * splat(ts * ts / 2)
@@ -279,6 +280,7 @@ def _prepare(work, cells, b, block, w, g, time, symbol, send, antenna):
     sent = carrier - splat(slope) * element
     cycles = element * (carrier - splat(slope / 2) * element)
     frequency = sent * step + splat(slope * ts) * element
+    # grid cell of the frequency [cycles/sample], and the distance from its middle
     position = (frequency - floor(frequency)) * splat(size * _BELOW)
     cell = floor(position)
     store(cells, 0, cell)
@@ -286,6 +288,7 @@ def _prepare(work, cells, b, block, w, g, time, symbol, send, antenna):
     curvature = narrow(
         (sent * a + splat(slope) * step * (splat(ts) - splat(0.5) * step)) * splat(half * half)
     )
+    # factor times exp(j 2 pi phase), with q c of the quadratic term's mean; then q and lambda
     c, s = cos_sin(
         narrow(cycles - floor(cycles + splat(0.5))) + curvature * splat(np.float32(g.centre))
     )
@@ -344,6 +347,7 @@ def _spread(grid, base, cells, scratch, count, taps, steer, k, work, centre):
     """Add `count` of 16 paths to `width` rows each of the grid that lies from float `base`, with
     every element's own delay: strengths of 1, j x and x^2 - c."""
     for i in range(count):
+        # strengths of 1, j x and x^2 - c by the module's equation
         at = base + int(cells[i]) * ROW
         er, ei, theta, q = _centred(steer, work, i, k)
         minus = theta * theta * splat(-_HALF)
@@ -425,6 +429,7 @@ def _chirps(out, shape, first_channel, w, g, contributions, t, noise, workspace)
     for batch in range(g.order.parts.shape[0]):
         start, count, segment = g.order.parts[batch]
         chirps = g.order.chirp[start : start + count]
+        # spread: blocks of paths that are sent in a chirp and pass the filter
         grid[:] = np.float32(0)
         for i in range(b.blocks.shape[0]):
             q, used = b.blocks[i, 0], b.blocks[i, 2]
@@ -447,6 +452,7 @@ def _chirps(out, shape, first_channel, w, g, contributions, t, noise, workspace)
                 _spread(grid, to, cells, scratch, used, g.taps, steer, k, work, centre)
         if faint.paths.groups.shape[0]:
             add_below_noise(grid, faint.paths, segment, chirps, t, w, faint.buffer, faint.workspace)
+        # transform and divide; paths one by one, noise; write
         for c in range(count):
             m, p = chirps[c] // num_chirps, chirps[c] % num_chirps
             table = grid[c * stride : (c + 1) * stride]
@@ -556,11 +562,13 @@ def make_gridded(
     noise : power, and the two words of its key (`isac_rt.signal.noise`)
     """
     w, t, shape = waveform, tones, samples.shape
+    # received paths, those below noise apart, in blocks
     path, offset = t.sources(w)
     reach = w.frame_duration / 2
     faint_path = (faint & (t.begin <= -reach) & (t.end >= reach))[path]
     kernel = weights(w.num_samples, OVERSAMPLING, WIDTH, TAPS)
     b = _blocks(w, t, path[~faint_path], offset[~faint_path])
+    # order of the chirps: many at once where the paths do not stay in the cache
     count = w.num_groups * w.num_chirps
     weak, order = (path[faint_path], offset[faint_path]), plain_batches(count, 1)
     if b.path.size > _MANY:
@@ -592,6 +600,7 @@ def make_gridded(
     )
     flat, rx, shared = samples.reshape(-1).view(np.float32), (t.rx_delay, t.rx_gain), numbers(w)
     one_after_the_other = one_by_one(w, alone)
+    # sixteen receive elements at a time
     for first in range(0, shape[1], LANES):
         steer = _steering(w, rx, b.path, first)
         paths = no_paths(t.tx_delay.shape[1])

@@ -16,6 +16,7 @@ def rasterise(corners, depth, face):
         ax, ay, az = corners[f, 0]
         bx, by, bz = corners[f, 1]
         cx, cy, cz = corners[f, 2]
+        # twice the signed area, and the pixels of the bounding box
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
         if area == 0.0:
             continue
@@ -30,6 +31,7 @@ def rasterise(corners, depth, face):
         for row in range(low, high + 1):
             y = row + 0.5
             for column in range(left, right + 1):
+                # barycentric coordinates of the pixel's middle, then its depth
                 x = column + 0.5
                 b = ((x - ax) * (cy - ay) - (cx - ax) * (y - ay)) / area
                 c = ((bx - ax) * (y - ay) - (x - ax) * (by - ay)) / area
