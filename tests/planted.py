@@ -185,8 +185,8 @@ OF_CASES = {
     ),
     "cross section of a large uav": Bug(
         "propagation/rcs.py",
-        "np.minimum(12 * (off / width) ** 2, depth)",
-        "np.minimum(12 * (2 * off / width) ** 2, depth)",
+        "12 * (off / lobe.azimuth_width) ** 2",
+        "12 * (2 * off / lobe.azimuth_width) ** 2",
     ),
     "fluctuation of a cross section": Bug(
         "propagation/rcs.py",

@@ -241,7 +241,7 @@ MAX_LINES = {
     "world": 3765,
     "propagation": 4772,
     "signal": 837,
-    "receive": 6073,
+    "receive": 6075,
     "track": 1931,
     "scenario": 2070,
     "results": 3702,
