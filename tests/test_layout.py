@@ -243,7 +243,7 @@ MAX_LINES = {
     "signal": 837,
     "receive": 6075,
     "track": 1931,
-    "scenario": 2070,
+    "scenario": 2089,
     "results": 3702,
     "simulation": 3680,
     "sweep": 2785,

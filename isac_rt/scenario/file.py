@@ -99,7 +99,8 @@ def _missing_files(tree: Mapping[str, Any], folder: Path) -> Iterator[Problem]:
 
 def folded_tree(scenario: Scenario, keys: Iterable[str]) -> dict[str, Any]:
     """A scenario as plain values, in which the formations that `keys` name stand as they were
-    stated, so that these keys can be replaced; `isac_rt.scenario.swarm.unfolded` undoes it.
+    stated, so that these keys can be replaced; `isac_rt.scenario.swarm.unfolded` undoes it. What a
+    sensor that they name filled in is left out.
 
     Parameters
     ----------
@@ -120,7 +121,25 @@ def folded_tree(scenario: Scenario, keys: Iterable[str]) -> dict[str, Any]:
             swarm[name] = uav
             if name != key:
                 swarm[name] = {**uav, "formation": plain_tree(scenario.formations[name])}
+    for key in keys:
+        path = key.split(".")
+        if path == ["sensor"]:
+            tree = _without_sensor(tree)
+        elif path[-1] == "sensor" and path[1] in swarm:
+            swarm[path[1]] = _without_sensor(swarm[path[1]])
     return {**tree, "swarm": swarm}
+
+
+def _without_sensor(node: dict[str, Any]) -> dict[str, Any]:
+    """Return a scenario or a terminal as plain values without those of its sensor, or the
+    defaults where it has none."""
+    radar = {"role": "active", "position_m": [0.0, 0.0, 1.0]}
+    usual = Scenario.model_validate({"sensor": node.get("sensor"), "swarm": {"radar": radar}})
+    out, filled = dict(node), plain_tree(usual)
+    for part in ("radio", "array", "noise"):
+        stated = out.get(part, {}).items()
+        out[part] = {key: value for key, value in stated if filled[part].get(key) != value}
+    return out
 
 
 class _Dumper(yaml.SafeDumper):

@@ -13,7 +13,7 @@ from oracles import mixed_chirps
 import isac_rt as irt
 from isac_rt.document import ScenarioError
 from isac_rt.frame.link import Link
-from isac_rt.scenario.file import to_yaml
+from isac_rt.scenario.file import folded_tree, to_yaml
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Exact
 
@@ -237,3 +237,19 @@ def test_a_radar_takes_its_boards_file(tmp_path):
     assert (radio.carrier_hz, radio.samples_per_chirp, radio.chirps_per_frame) == (77.5e9, 64, 32)
     assert scenario.frame_interval_s == TREE["frame_interval_s"]
     assert irt.prepare(scenario).of("B").waveform.slope == pytest.approx(30e12)
+
+
+def test_sweeps_take_boards_as_values():
+    """A board in place of another, of all or of one radar, is as if the file had named it; what the
+    file states stays. Bug: the first board's numbers stated beside the second one's name."""
+    tree = changed("B", radio={"chirps_per_frame": 24}) | {"sensor": "iwr6843"}
+    tree |= {"radio": {"samples_per_chirp": 128}, "array": {"element_gain_dbi": 6.5}}
+    base = irt.load(tree)
+    for board in ("awr2944", "awr1642"):
+        folded = folded_tree(base, ["sensor"]) | {"sensor": board}
+        assert irt.load(folded).model_dump() == irt.load(tree | {"sensor": board}).model_dump()
+        folded = folded_tree(base, ["swarm.B.sensor"])
+        folded["swarm"]["B"]["sensor"] = board
+        other = copy.deepcopy(tree)
+        other["swarm"]["B"]["sensor"] = board
+        assert irt.load(folded).model_dump() == irt.load(other).model_dump()
