@@ -139,6 +139,18 @@ def curvature(g: Gaussian, own: Pose, transmitter: np.ndarray | None = None) -> 
     return out
 
 
+def narrowed(
+    g: Gaussian, R: np.ndarray, own: Pose, transmitter: np.ndarray | None = None
+) -> Gaussian:
+    """Return states (K, S) with the covariance that directions measured with covariances R (K, 4,
+    4) leave: `update` linearises where it ends, so that only what stays unknown bends. What range
+    and rate tell about places across them is what bends."""
+    P, H = g.covariance, jacobian(g.mean, own, transmitter)[:, 2:]
+    HP = H @ P
+    S = HP @ np.swapaxes(H, 1, 2) + R[:, 2:, 2:]
+    return Gaussian(g.mean, P - np.swapaxes(HP, 1, 2) @ np.linalg.solve(S, HP))
+
+
 def _segment_hessian(offset: np.ndarray, velocity: np.ndarray) -> np.ndarray:
     """Return the second derivatives (..., 2, 6, 6) of (length, rate) of one path segment with
     respect to relative position and velocity."""

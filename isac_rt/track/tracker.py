@@ -23,6 +23,7 @@ from isac_rt.track.filter import (
     expected,
     initiate_all,
     measurement_covariance,
+    narrowed,
     predict,
     reported,
     update,
@@ -303,7 +304,9 @@ class Tracker(Stateful):
                 np.array(part) for part in zip(*(t.state for t in tracks), strict=True)
             )
             state = Gaussian(mean, covariance)
-            R = measurement_covariance(std[q], mean, transmitter) + curvature(state, own, sender)
+            R = measurement_covariance(std[q], mean, transmitter)
+            left = narrowed(state, R, own, sender) if all(kind) else state
+            R = R + curvature(left, own, sender)
             after = update(state, z[q], R, own, sender, ambiguity=self.ambiguity)
             for track, *of_track in zip(tracks, *after, strict=True):
                 track.state = Gaussian(*of_track)

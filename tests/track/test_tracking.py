@@ -22,6 +22,7 @@ from isac_rt.track.filter import (
     initiate,
     jacobian,
     measure,
+    narrowed,
     measurement_covariance,
     predict,
     singer,
@@ -280,6 +281,18 @@ def test_curvature_is_what_linearisation_leaves_out(transmitter):
         found[:2, :2] / np.outer(scale, scale), abs=0.05
     )
     assert not found[2:].any() and not found[:, 2:].any()
+
+
+def test_what_directions_leave_unknown_is_that_of_the_information_form():
+    """P^-1 + H^T R^-1 H with the derivatives H of both cosines by complex steps is the inverse of
+    the covariance left; planted bug: the rows of range and rate."""
+    mean, root = np.append(BODY, np.zeros(3)), np.random.default_rng(3).standard_normal((9, 9))
+    P, R = root @ root.T, np.diag(STD**2)
+    steps = mean + 1e-30j * np.eye(9)
+    H = np.array([measure(x, OWN)[2:].imag / 1e-30 for x in steps]).T
+    found = narrowed(Gaussian(mean[None], P[None]), R[None], OWN).covariance[0]
+    expected = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.inv(R[2:, 2:]) @ H)
+    assert found == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
 def test_a_board_that_hardly_tells_heights_tracks_them():
