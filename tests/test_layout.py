@@ -242,7 +242,7 @@ MAX_LINES = {
     "propagation": 4772,
     "signal": 837,
     "receive": 6075,
-    "track": 1931,
+    "track": 1946,
     "scenario": 2089,
     "results": 3702,
     "simulation": 3680,
