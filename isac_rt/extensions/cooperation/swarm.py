@@ -148,8 +148,7 @@ class Cooperation(Stateful):
         detect a UAV and has no track. A passive terminal's errors near the line of sight and over
         unknown paths are larger than it knows: most such tracks are doubles of one that the active
         terminal has elsewhere."""
-        active = self._setup.timetable.with_role("active", frame)  # in frames without echoes, too
-        own = [Link(name, name) for name in active]
+        own = [Link(name, name) for name in self._setup.timetable.with_role("active", frame)]
         if uav.terminal is not None or {k.origin for k in uav.members} & set(map(str, own)):
             return False
         place = uav.state.mean[:3]
