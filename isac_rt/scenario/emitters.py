@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -12,6 +12,8 @@ from isac_rt.scenario.swarm import Uav
 from isac_rt.settings import Decibels, Finite, Node, Positive, Problem, Vector
 from isac_rt.world.settings import Rcs, Waypoint
 
+FLIGHT = ("position_m", "velocity_mps", "waypoints", "boresight", "mount_deg")
+"""Keys that an emitter shares with a UAV."""
 TRANSPARENT_DBSM = -200.0
 """Cross-section of what does not scatter."""
 
@@ -26,8 +28,12 @@ class Emitter(Node):
     """Velocity of a straight flight: east, north, up [m/s]. By default it stands."""
     waypoints: tuple[Waypoint, ...] | None = None
     """Places with their times on a smooth curve, in place of `position_m`."""
-    boresight: Vector
-    """Direction [x, y, z] in which its antenna looks, of any length."""
+    boresight: Literal["velocity"] | Vector = "velocity"
+    """Direction [x, y, z] in which its antenna looks, of any length, or `velocity`, the default:
+    where it moves to."""
+    mount_deg: Vector = (0.0, 0.0, 0.0)
+    """How the antenna is turned against its boresight: yaw, pitch, roll [degrees]. By default
+    not."""
     power_dbm: Decibels = 12.0
     """Transmit power [dBm]. The default is what one channel of a 77 GHz radar chip delivers."""
     array: Array = Array()
@@ -41,7 +47,7 @@ class Emitter(Node):
     """Duration of the ramp of a chirp [us]."""
     idle_us: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     """Pause between a ramp's end and the next one's start [us]."""
-    offset_us: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    offset_us: Finite | None = None
     """Start of its first chirp, or of the first of each burst, after time 0 [us]. null, the
     default: drawn within one repetition by `seed` and name."""
     burst_chirps: Annotated[int, Field(ge=1, le=100_000)] | None = None
@@ -51,16 +57,15 @@ class Emitter(Node):
 
     def uav(self) -> Uav:
         """Return the emitter as a transparent body that sends."""
-        flight: dict[str, Any] = {"waypoints": self.waypoints}
-        if self.waypoints is None:
-            flight = {"position_m": self.position_m, "velocity_mps": self.velocity_mps}
         body = {"body_radius_m": 0, "rcs": Rcs(value_dbsm=TRANSPARENT_DBSM), "array": self.array}
-        return Uav(role="active", boresight=self.boresight, **body, **flight)
+        return Uav(role="active", **body, **self._flight)
+
+    @property
+    def _flight(self) -> dict[str, Any]:
+        return {key: getattr(self, key) for key in FLIGHT if key in self.model_fields_set}
 
     def problems(self) -> Iterator[Problem]:
-        flight = {"position_m", "velocity_mps", "waypoints"} & self.model_fields_set
-        stated = {name: getattr(self, name) for name in flight}
-        yield from Uav.model_construct(role="active", **stated).problems()
+        yield from Uav.model_construct(role="active", **self._flight).problems()
         if not any(self.boresight):
             yield Problem((("boresight",),), "points nowhere; give a direction such as [0, 1, 0]")
         if self.slope_mhz_per_us * self.ramp_us * 1e6 + self.start_hz <= 0:

@@ -30,7 +30,7 @@ class Uav(settings.Uav):
     below. null, the default: that of all."""
     radio: Radio | None = None
     """This terminal's chirp in `mode: fmcw`: what is stated overrides `radio`. Radars of different
-    chirps do not receive each other. null, the default: that of all."""
+    chirps disturb each other (docs/weather.md). null, the default: that of all."""
     array: Array | None = None
     """This terminal's antennas: what is stated overrides `array`. As many transmit elements as
     there, but beside a `radio`. null, the default: those of all."""

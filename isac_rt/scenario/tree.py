@@ -31,7 +31,7 @@ from isac_rt.frame.front_end import Elements, FrontEnd
 from isac_rt.frame.settings import Array, Modulation, Noise, RoleChange
 from isac_rt.propagation.settings import Clutter, Propagation, Weather
 from isac_rt.receive.settings import Receivers
-from isac_rt.scenario.emitters import Emitter
+from isac_rt.scenario.emitters import FLIGHT, Emitter
 from isac_rt.scenario.presets import Preset, ReceiverSet, with_preset
 from isac_rt.scenario.radio import Radio
 from isac_rt.scenario.sensors import SENSORS, BoardFile, Sensor, with_sensor
@@ -175,7 +175,8 @@ class Scenario(Node):
 
     def by_chirp(self) -> tuple[Scenario, ...]:
         """The scenario as the radars of each chirp have it for themselves: their `radio` is that of
-        all, the other radars are targets. The common chirp comes first; where all have it, this
+        all, the other radars are targets, and emitters where their chirps sweep over the same
+        frequencies and send a stated power. The common chirp comes first; where all have it, this
         very scenario is returned."""
         radars = [n for n, u in self.swarm.items() if u.role == "active"]
         if self.radio.mode != "fmcw" or not radars:
@@ -185,7 +186,8 @@ class Scenario(Node):
         groups = [[n for n in radars if self._chirp_of(n) == chirp] for chirp in different]
         if len(groups[0]) == len(radars):
             return (self,)
-        return tuple(self._alone(names) for names in groups if names)
+        parts = [self._alone(names) for names in groups if names]
+        return tuple(part._among([one for one in parts if one is not part]) for part in parts)
 
     def _chirp_of(self, name: str) -> tuple[Radio, int]:
         """Return the radio and the number of transmit elements of a terminal."""
@@ -203,6 +205,44 @@ class Scenario(Node):
         interval = self.frame_interval_s or self.frame_duration_s
         alone = {"sensor": None, "swarm": swarm, "frame_interval_s": interval}
         return self.model_copy(update=shared | alone)
+
+    def _among(self, others: Sequence[Scenario]) -> Scenario:
+        """Return the scenario of some radars with those of other chirps as emitters."""
+        emitters = dict(self.emitters)
+        if self.noise.model == "link_budget":
+            low, high = self._band
+            for one in others:
+                if max(low, one._band[0]) < min(high, one._band[1]):
+                    names = [name for name, uav in one.swarm.items() if uav.role == "active"]
+                    emitters |= {name: one._as_emitter(name) for name in names}
+        return self.model_copy(update={"emitters": emitters})
+
+    @property
+    def _band(self) -> tuple[float, float]:
+        """Frequencies at the start and the end of a chirp [Hz]."""
+        return self.radio.carrier_hz, self.radio.carrier_hz + self.radio.bandwidth_hz
+
+    def _as_emitter(self, name: str) -> Emitter:
+        """Return an active radar as what others receive of it; antennas that send at once add their
+        powers."""
+        uav, times = self.swarm[name], self.radio.times(self.num_tx)
+        at_once = self.num_tx if self.radio.bands(self.num_tx) > 1 else 1
+        slope = self.radio.bandwidth_hz / times.chirp * 1e-12
+        if self.radio.chirp is not None:
+            slope = self.radio.chirp.slope_mhz_per_us
+        late = self.first_blocks()[name] * 2 * times.max_delay + uav.clock_offset_s
+        return Emitter(
+            **{key: getattr(uav, key) for key in FLIGHT if key in uav.model_fields_set},
+            power_dbm=self.noise_of(name).tx_power_dbm + 10 * math.log10(at_once),
+            array=uav.array or self.array,
+            start_hz=self.radio.carrier_hz,
+            slope_mhz_per_us=slope,
+            ramp_us=times.chirp * 1e6,
+            idle_us=(times.slot - times.chirp) * 1e6,
+            offset_us=late * 1e6,
+            burst_chirps=self.radio.chirps_per_frame,
+            burst_interval_s=self.frame_interval_s,
+        )
 
     @property
     def num_tx(self) -> int:

@@ -114,8 +114,10 @@ def make_plan(setup: Setup) -> dict[str, Any]:
         names = ", ".join(part.plan.timetable.blocks) if setup.by_chirp else "all"
         items += [replace(i, link=names) if i.link == "all" else i for i in _items(part, frames)]
     if setup.by_chirp:
-        left = "interference, where their bands overlap"
-        items.append(Item("chirps of other radars", "those of the same chirp", left))
+        stated = setup.scenario.noise.model == "link_budget"
+        left = "nothing" if stated else "interference, where their bands overlap"
+        said = "where their bands overlap" if stated else "those of the same chirp"
+        items.append(Item("chirps of other radars", said, left))
     return {
         **setup.fidelity(),
         "coverage": asdict(setup.coverage),

@@ -306,8 +306,8 @@ def warn_of_interference(
 
 
 def warn_of_other_chirps(waveforms: Mapping[str, Waveform]) -> None:
-    """Warn of plain radars whose different chirps, by name, sweep over the same frequencies: a run
-    leaves out their interference."""
+    """Warn of plain radars without a stated power whose different chirps, by name, sweep over the
+    same frequencies: a run leaves out their interference."""
     bands = {
         name: (w.carrier_frequency, w.carrier_frequency + w.slope * w.chirp_duration)
         for name, w in waveforms.items()
@@ -320,7 +320,7 @@ def warn_of_other_chirps(waveforms: Mapping[str, Waveform]) -> None:
     if pairs:
         _warn(
             f"{', '.join(pairs)} sweep over the same frequencies with different chirps; the run "
-            "leaves out that they interfere; choose other carriers, or turn them away"
+            "leaves out that they interfere, for noise.model snr knows no power; take link_budget"
         )
 
 

@@ -571,7 +571,8 @@ def planned(scenario: Scenario) -> Plan:
 
 def _joint(scenario: Scenario, parts: Sequence[Setup]) -> Setup:
     """Return the set-ups of the radars of each chirp as one."""
-    warn_of_other_chirps({", ".join(one.plan.timetable.blocks): one.waveform for one in parts})
+    if scenario.noise.model == "snr":
+        warn_of_other_chirps({", ".join(one.plan.timetable.blocks): one.waveform for one in parts})
     roles = {name: uav.role for name, uav in scenario.swarm.items()}
     silent: dict[str, int | None] = dict.fromkeys(scenario.first_blocks())
     each = []

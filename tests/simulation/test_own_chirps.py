@@ -181,13 +181,17 @@ def test_files_name_each_radars_chirp(tmp_path):
     assert {i["link"] for i in plan["items"]} == {"all", "A", "B", "A->A", "B->B"}
 
 
-def test_different_chirps_in_one_band_are_doubted():
-    """Said once, and not where bands are apart. Bug: carriers alone compared."""
+def test_different_chirps_in_one_band_of_unknown_power_are_doubted():
+    """Said once, and neither where bands are apart nor where powers are stated. Bug: carriers alone
+    compared; warned of in a link budget too."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         irt.prepare(irt.load(TREE))
         assert not [one for one in said if "same frequencies" in str(one.message)]
-        irt.prepare(irt.load(changed("B", sensor="awr1843", radio={"carrier_hz": 76.5e9})))
+        tree = changed("B", sensor="awr1843", radio={"carrier_hz": 76.5e9})
+        irt.prepare(irt.load(tree))
+        assert not [one for one in said if "same frequencies" in str(one.message)]
+        irt.prepare(irt.load(tree | {"noise": {"model": "snr"}}))
     about = [str(one.message) for one in said if "same frequencies" in str(one.message)]
     assert len(about) == 1 and about[0].startswith("A and B sweep")
 

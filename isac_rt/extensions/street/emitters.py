@@ -168,8 +168,9 @@ class Emitters:
             if air is not None:
                 found = replace(found, gain=found.gain * 10 ** (-air.loss_db(found) / 20))
             amplitude = 10 ** ((self._scenario.emitters[link.tx].power_dbm - 30) / 20)
-            arrival = Arrival(self._trains[link.tx], amplitude, found)
-            out.setdefault(link.rx, []).append(arrival)
+            train, late = self._trains[link.tx], self._scenario.swarm[link.rx].clock_offset_s
+            by_clock = replace(train, offset=train.offset - late)
+            out.setdefault(link.rx, []).append(Arrival(by_clock, amplitude, found))
         return out
 
 

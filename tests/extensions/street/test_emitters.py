@@ -246,6 +246,82 @@ def test_samples_hold_what_arrives_and_the_plan_says_how_much():
     assert f"floor {rise:.2g} dB up" in rows["AT->AT"]["modelled"]
 
 
+TWO = {
+    "frames": 4,
+    "frame_interval_s": 0.02,
+    "sensor": "awr1843",
+    "swarm": {
+        "A": {"role": "active", "position_m": [0, 0, 5], "boresight": [0, 1, 0]},
+        "B": {
+            "role": "active",
+            "position_m": [3, 40, 6],
+            "velocity_mps": [1, -9, 0],
+            "boresight": [0, -1, 0],
+            "clock_offset_s": 4e-6,
+            "radio": {
+                "chirps_per_frame": 64,
+                "scheme": "ddm",
+                "sub_bands": 4,
+                "chirp": {
+                    "slope_mhz_per_us": 18.0,
+                    "idle_us": 6.0,
+                    "adc_start_us": 6.0,
+                    "ramp_end_us": 34.0,
+                },
+            },
+        },
+    },
+}
+
+
+@pytest.mark.filterwarnings("ignore::isac_rt.scenario.file.ScenarioWarning")
+def test_radars_of_two_chirps_disturb_each_other():
+    """Numbers of the data sheet, by hand: B in the samples of A and A in those of B, and neither
+    where its carrier is elsewhere. Planted bug: the power of one antenna of three; the clock of B
+    ignored where it sends, or where it receives; bands taken to overlap anywhere."""
+    setup = prepare(load(TWO))
+    frame, at_a, at_b = setup.frame(3), ("A", "A"), ("B", "B")
+    power = 10 ** ((12 - 30) / 20)
+    trains = {
+        "A": (Train(77e9, 18e12, 34e-6, 40e-6, 4e-6, 64, 0.02), power * np.sqrt(3)),
+        "B": (Train(77e9, 15e12, 33e-6, 40e-6, -4e-6, 192, 0.02), power),
+    }
+    for link, other in ((at_a, "B"), (at_b, "A")):
+        part = setup.of(link[0])
+        of_part = part.frame(3)
+        extra = frame.samples(link).samples - replace(of_part, foreign={}).samples(link).samples
+        here, there = (part.swarm.trajectories[n] for n in (link[0], other))
+        when = part.timetable.epoch(3, link[0])
+        line = there.pose(when).position - here.pose(when).position
+        distance = np.linalg.norm(line)
+        gains = [
+            part.antennas.element_gain(pose.to_body(sign * line / distance))
+            for pose, sign in ((here.pose(when), 1), (there.pose(when), -1))
+        ]
+        closing = there.pose(when).velocity - here.pose(when).velocity
+        path = make_paths(
+            gain=[part.waveform.wavelength / (4 * np.pi * distance) * np.sqrt(np.prod(gains))],
+            delay=[distance / SPEED_OF_LIGHT],
+            delay_rate=[closing @ line / distance / SPEED_OF_LIGHT],
+            departure=[-line / distance],
+            arrival=[line / distance],
+            rx_radius=[distance],
+            kind=PathKind.LINE_OF_SIGHT,
+            epoch=when,
+            tx=other,
+            rx=link[0],
+        )
+        truth = np.zeros(extra.shape, complex)
+        ear = ReceiveArray(here.pose(when), part.antennas)
+        start = Reference(part.timetable.start_time(3, link[0]))
+        add_foreign(truth, part.waveform, Arrival(*trains[link[0]], path), ear, start)
+        assert np.linalg.norm(truth) ** 2 > truth.size * frame.noise_power(link)
+        assert np.linalg.norm(extra - truth) < 0.03 * np.linalg.norm(truth)
+    apart = {**TWO["swarm"]["B"], "radio": {**TWO["swarm"]["B"]["radio"], "carrier_hz": 79e9}}
+    elsewhere = prepare(load({**TWO, "swarm": {**TWO["swarm"], "B": apart}})).frame(1)
+    assert all(not part.foreign for part in elsewhere._by_chirp.values())
+
+
 @pytest.mark.parametrize(
     ("more", "said"),
     [
