@@ -13,7 +13,6 @@ from extensions.access.test_access_run import run as access_run
 from simulation.test_fall_back import scenario as dense
 from talking import scenario as talking
 
-from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.views.plots import Plots
 
@@ -64,14 +63,16 @@ def test_the_gallery_draws_its_scenarios(k, tmp_path, monkeypatch):
     assert (tmp_path / "picture.png").stat().st_size > 20_000
 
 
-def test_the_gallery_shows_twelve_scenarios(tmp_path):
+def test_the_gallery_shows_twelve_scenarios(tmp_path, monkeypatch):
     """All are read, and drawn by what is there. Planted bug: a key that is gone."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
+    import gallery as pictures
+
     entries = gallery()
     assert len(entries) == 12
-    (tmp_path / "data").symlink_to(ROOT / "scenes" / "data")
-    for what, text in entries:
-        (tmp_path / "scene.yaml").write_text(text)
-        load(tmp_path / "scene.yaml")
+    for k, (what, text) in enumerate(entries):
+        (folder := tmp_path / f"{k}").mkdir()
+        pictures.scenario_of(text, folder)
         assert what == "view" or hasattr(Plots, what.split()[0])
 
 

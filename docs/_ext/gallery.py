@@ -1,12 +1,14 @@
 """Directive `picture`: draws what the scenario below it gives, and shows both.
 
 The argument is `view`, or a method of `isac_rt.Plots` with its arguments: `range_doppler PT1`,
-`paths AT doppler`.
+`paths AT doppler`. The content is a scenario, or `canyon.yaml`, the first one, with options.
 """
 
 from __future__ import annotations
 
 import hashlib
+import re
+import shlex
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -15,24 +17,39 @@ from docutils import nodes
 from sphinx.util.docutils import SphinxDirective
 
 SCENES = Path(__file__).parents[2] / "scenes"
+PAGE = Path(__file__).parents[1] / "gallery.md"
+ENTRY = re.compile(r"^```\{picture\} (.+)\n((?:.*\n)*?)```", re.MULTILINE)
+"""What is drawn, and the content, of a picture of the page."""
+FIRST = "canyon.yaml"
 SNAPSHOTS = 2
 
 
+def scenario_of(text: str, folder: Path) -> Any:
+    """Read the scenario of an entry by way of a file in a folder."""
+    import isac_rt as irt
+
+    words = shlex.split(text) if text.startswith(FIRST) else []
+    first = ENTRY.search(PAGE.read_text(encoding="utf-8"))
+    assert first is not None
+    (folder / "data").symlink_to(SCENES / "data")
+    (folder / "scene.yaml").write_text(first[2] if words else text)
+    return irt.load(folder / "scene.yaml", words[2::2])
+
+
 def draw(text: str, words: list[str], file: Path) -> None:
-    """Simulate the scenario `text`, whose files are those of `scenes/`, and draw it into `file`."""
+    """Simulate the scenario of an entry, whose files are those of `scenes/`, and draw it into
+    `file`."""
     import matplotlib.pyplot as plt
 
     import isac_rt as irt
     from isac_rt.cli.cli import main
 
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "data").symlink_to(SCENES / "data")
-        (Path(folder) / "scene.yaml").write_text(text)
+        scenario = scenario_of(text, Path(folder))
         what, *arguments = words
         if what == "view":
             assert main(["view", f"{folder}/scene.yaml", "--out", str(file)]) == 0, text
             return
-        scenario = irt.load(Path(folder) / "scene.yaml")
         results = irt.run(scenario, snapshots=SNAPSHOTS, progress=False)
         axes = getattr(irt.Plots(results), what)(*arguments)
         axes.figure.savefig(file, dpi=110)
@@ -48,10 +65,12 @@ class Picture(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         text = "\n".join(self.content) + "\n"
-        code = nodes.literal_block(text, text, language="yaml")
+        shown = f"isac-rt run {text}" if text.startswith(FIRST) else text
+        code = nodes.literal_block(shown, shown, language="sh" if shown != text else "yaml")
         if not self.config.gallery_draws:
             return [code]
-        mark = hashlib.sha256((self.arguments[0] + text).encode()).hexdigest()[:16]
+        content = self.arguments[0] + text + PAGE.read_text(encoding="utf-8")
+        mark = hashlib.sha256(content.encode()).hexdigest()[:16]
         folder = Path(self.env.app.outdir) / "_static" / "gallery"
         folder.mkdir(parents=True, exist_ok=True)
         if not (file := folder / f"{mark}.png").exists():
