@@ -146,7 +146,13 @@ def _items(setup: Setup, frames: Sequence[int]) -> list[Item]:
         items += _link_items(setup, link, of_link)
     items += _unmodelled_items(setup, light, next_slot, short_lived / len(frames))
     if setup.moving_centres is not None:
-        items += [Item(**row) for row in setup.moving_centres.report()]
+        chirps = setup.waveform.num_chirps
+        over_noise = {
+            link: setup.plan.cell_noise_gain(link.tx) / chirps / last.noise_power(link)
+            for link in traced
+        }
+        rows = setup.moving_centres.report(traced, poses, over_noise)
+        items += [Item(**row) for row in rows]
     items += [] if setup.has_ideal_hardware else _hardware_items(last)
     return (
         items

@@ -186,7 +186,9 @@ class Frame:
             clock = s.connections.clock_difference(name, link, when)
             paths = self.paths[Link(name, link.rx)]
             if s.moving_centres is not None:
-                paths = s.moving_centres.with_centres(paths, self.poses, when)
+                cell = s.plan.cell_noise_gain(name) / s.waveform.num_chirps  # of one chirp
+                least = s.plan.weakest * self.noise_power(link) / cell
+                paths = s.moving_centres.with_centres(paths, self.poses, when, least)
             sent = replace(self.sent[name], clock_offset=clock.offset, clock_drift=clock.drift)
             out += [(stream, paths) for stream in sent.streams()]
         return out

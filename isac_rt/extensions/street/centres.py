@@ -32,6 +32,7 @@ from isac_rt.extensions.street.motion import CentreModel, Motion
 from isac_rt.extensions.street.rotors import blades_of
 from isac_rt.extensions.street.walker import walker_of_flight
 from isac_rt.frame.antennas import Arrays
+from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathSet, make_paths, merge
 from isac_rt.propagation.rcs import CrossSection
@@ -82,48 +83,85 @@ class MovingCentres:
     arrays: Arrays
     models: Sequence[tuple[str, CentreModel]]
 
-    def with_centres(self, paths: PathSet, poses: Mapping[str, Pose], middle: float) -> PathSet:
+    def with_centres(
+        self,
+        paths: PathSet,
+        poses: Mapping[str, Pose],
+        middle: float,
+        least_power: float = 0.0,
+    ) -> PathSet:
         """Return a link's paths with those over centres, piece by piece of the frame.
 
         Parameters
         ----------
         poses : at the paths' epoch
         middle : of the receiver's frame [s]
+        least_power : |gain|^2 of all centres together that a path over them must exceed
         """
         target = np.array([*paths.target_names, ""])[paths.target]
         gives_way = [name for name, model in self.models if model.replaces_echo]
         parts = [paths.select(~np.isin(target, gives_way))]
         for name, model in self.models:
-            rows = np.flatnonzero(target == name)
-            if rows.size:
-                attitude = self._attitude(name, paths.epoch)
+            attitude = self._attitude(name, paths.epoch)
+            bases = self._bases(paths, target == name, poses, (name, model, attitude))
+            least = 0.0 if model.replaces_echo else least_power
+            bases = [base for base in bases if base.power > least]
+            if bases:
                 places = model.motion(np.array([paths.epoch])).place
                 reach = float(np.linalg.norm(places, axis=-1).max())
                 speed = model.speed + reach * float(np.linalg.norm(attitude.rate))
                 slots = self._slots_of_piece(paths, name, (speed, model.jerk), poses)
                 begin, time = self.pieces(slots, middle - paths.epoch)
                 offset = attitude.turned(model.motion(paths.epoch + time), time)
-                for row in rows:
-                    one = paths.select(np.array([row]))
-                    parts.append(
-                        self._copies(one, poses, (name, model, attitude), offset, (begin, time))
-                    )
+                parts += [_copies(base, offset, begin, time) for base in bases]
         return merge(parts) if len(parts) > 1 else paths
 
-    def report(self) -> list[dict[str, Any]]:
-        """Return what the plan says of each model: `Item`'s values by name."""
+    def _bases(
+        self,
+        paths: PathSet,
+        which: np.ndarray,
+        poses: Mapping[str, Pose],
+        of: tuple[str, CentreModel, Attitude],
+    ) -> list[Base]:
+        """Return the paths of a UAV that are copied to the centres of a model."""
+        (name, model, attitude), out = of, []
+        for row in np.flatnonzero(which):
+            path = paths.select(np.array([row]))
+            images = end_images(path, poses, name)
+            towards = [poses[name].to_body(image.towards) for image in images]
+            section = self.sections[name].square_metres(*towards)
+            by_axes = (image.towards @ attitude.axes for image in images)
+            gain = model.amplitudes(*by_axes) * (path.gain / np.sqrt(section))
+            out.append(Base(path, *images, gain))
+        return out
+
+    def report(
+        self,
+        found: Mapping[Link, PathSet],
+        poses: Mapping[str, Pose],
+        over_noise: Mapping[Link, float],
+    ) -> list[dict[str, Any]]:
+        """Return what the plan says of each model: `Item`'s values by name.
+
+        Parameters
+        ----------
+        over_noise : by link, the mean power of a cell over the noise for a mean |gain|^2 of one
+        """
         w, out = self.waveform, []
-        widest = 1 / (2 * w.slot_duration)
+        widest, slot = 1 / (2 * w.slot_duration), w.chirp_duration - w.window_start
         for name, model in self.models:
-            edge = 2 * model.speed / w.wavelength
-            folds = int((edge + widest) // (2 * widest))
-            slot = w.chirp_duration - w.window_start
+            edge, level = 2 * model.speed / w.wavelength, -np.inf
+            for link, paths in found.items():
+                which = np.array([*paths.target_names, ""])[paths.target] == name
+                of = name, model, self._attitude(name, paths.epoch)
+                for base in self._bases(paths, which, poses, of):
+                    level = max(level, 10 * np.log10(base.power * over_noise[link]))
             error = 2 * np.pi * (w.carrier_frequency + w.bandwidth) * model.jerk
             out.append(
                 {
                     "what": f"moving parts of {name}",
-                    "modelled": f"{model.described()}; Doppler to {edge:.4g} Hz either side, "
-                    f"folded {folds} times into {widest:.4g} Hz by the slots",
+                    "modelled": f"{model.described()}, {level:.0f} dB over the noise of a cell; "
+                    f"Doppler to {edge:.4g} Hz either side, slots show {widest:.4g} Hz",
                     "left_out": "jerk within chirps",
                     "estimate": error * 2 * (slot / 2) ** 3 / (6 * SPEED_OF_LIGHT),
                     "unit": "rad",
@@ -173,51 +211,6 @@ class MovingCentres:
         before, now, after = (body_axes(self.swarm, name, epoch + t) for t in (-half, 0.0, half))
         ahead, behind = (Rotation.from_matrix(a @ now.T).as_rotvec() for a in (after, before))
         return Attitude(now, (ahead - behind) / (2 * half), (ahead + behind) / half**2)
-
-    def _copies(
-        self,
-        base: PathSet,
-        poses: Mapping[str, Pose],
-        of: tuple[str, CentreModel, Attitude],
-        offset: Motion,
-        slots: tuple[np.ndarray, np.ndarray],
-    ) -> PathSet:
-        """Return the copies of one path to all centres in all slots."""
-        (begin, time), (name, model, attitude) = slots, of
-        sent, received = end_images(base, poses, name)
-        there = segment(sent, time, offset)
-        back = there if received is sent else segment(received, time, offset)
-        towards = [poses[name].to_body(image.towards) for image in (sent, received)]
-        section = self.sections[name].square_metres(*towards)
-        by_axes = (image.towards @ attitude.axes for image in (sent, received))
-        amplitude = model.amplitudes(*by_axes) * (base.gain / np.sqrt(section))
-        rate = (there.rate + back.rate) / SPEED_OF_LIGHT
-        accel = (there.accel + back.accel) / SPEED_OF_LIGHT
-        t = time[:, None]
-        columns = {
-            "gain": amplitude * there.spreading * back.spreading,
-            "delay": base.delay
-            + (there.longer + back.longer) / SPEED_OF_LIGHT
-            - (rate - accel * t / 2) * t,
-            "delay_rate": base.delay_rate + rate - accel * t,
-            "delay_accel": base.delay_accel + accel,
-            "departure": _unit(base.departure + there.turn @ sent.mirror.T),
-            "arrival": _unit(base.arrival + back.turn @ received.mirror.T),
-            "tx_radius": np.where(np.isinf(base.tx_radius), np.inf, there.length),
-            "rx_radius": np.where(np.isinf(base.rx_radius), np.inf, back.length),
-            "begin": np.broadcast_to(np.maximum(begin[:-1, None], base.begin), rate.shape),
-            "end": np.broadcast_to(np.minimum(begin[1:, None], base.end), rate.shape),
-        }
-        flat: dict[str, Any] = {k: v.reshape(-1, *v.shape[2:]) for k, v in columns.items()}
-        same: dict[str, Any] = {k: getattr(base, k)[0] for k in ("kind", "target", "bounces")}
-        return make_paths(
-            tx=base.tx,
-            rx=base.rx,
-            epoch=base.epoch,
-            target_names=base.target_names,
-            **same,
-            **flat,
-        )
 
 
 class Attitude(NamedTuple):
@@ -275,6 +268,48 @@ class EndImage(NamedTuple):
     towards: np.ndarray
     from_uav: Motion
     mirror: np.ndarray
+
+
+class Base(NamedTuple):
+    """A path of a UAV, its ends as the UAV sees them, and the gains (K,) of centres there."""
+
+    path: PathSet
+    sent: EndImage
+    received: EndImage
+    gain: np.ndarray
+
+    @property
+    def power(self) -> float:
+        """|gain|^2 of all centres: their mean power within 3 dB."""
+        return float((np.abs(self.gain) ** 2).sum())
+
+
+def _copies(base: Base, offset: Motion, begin: np.ndarray, time: np.ndarray) -> PathSet:
+    """Return the copies of one path to centres that move by `offset` about the UAV, in pieces from
+    `begin` (T + 1,) about `time` (T,) [s since the epoch]."""
+    path = base.path
+    there = segment(base.sent, time, offset)
+    back = there if base.received is base.sent else segment(base.received, time, offset)
+    rate = (there.rate + back.rate) / SPEED_OF_LIGHT
+    accel = (there.accel + back.accel) / SPEED_OF_LIGHT
+    t = time[:, None]
+    longer = (there.longer + back.longer) / SPEED_OF_LIGHT
+    columns = {
+        "gain": base.gain * there.spreading * back.spreading,
+        "delay": path.delay + longer - (rate - accel * t / 2) * t,
+        "delay_rate": path.delay_rate + rate - accel * t,
+        "delay_accel": path.delay_accel + accel,
+        "departure": _unit(path.departure + there.turn @ base.sent.mirror.T),
+        "arrival": _unit(path.arrival + back.turn @ base.received.mirror.T),
+        "tx_radius": np.where(np.isinf(path.tx_radius), np.inf, there.length),
+        "rx_radius": np.where(np.isinf(path.rx_radius), np.inf, back.length),
+        "begin": np.broadcast_to(np.maximum(begin[:-1, None], path.begin), rate.shape),
+        "end": np.broadcast_to(np.minimum(begin[1:, None], path.end), rate.shape),
+    }
+    flat: dict[str, Any] = {k: v.reshape(-1, *v.shape[2:]) for k, v in columns.items()}
+    same: dict[str, Any] = {k: getattr(path, k)[0] for k in ("kind", "target", "bounces")}
+    (tx, rx), names = path.link, path.target_names
+    return make_paths(tx=tx, rx=rx, epoch=path.epoch, target_names=names, **same, **flat)
 
 
 def end_images(path: PathSet, poses: Mapping[str, Pose], name: str) -> tuple[EndImage, EndImage]:

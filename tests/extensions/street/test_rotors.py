@@ -307,6 +307,103 @@ def test_ghosts_follow_the_centre_over_the_mirror():
         assert pieces.tx_radius[row] == pytest.approx(np.linalg.norm(point - mirrored), abs=1e-3)
 
 
+def over_ground(frame, middle):
+    """Echo of Q from the radar with those by way of the ground, z = 0, which reflects by -0.8."""
+    radar, q = (frame.poses[name] for name in ("radar", "Q"))
+    images = np.array([radar.position, radar.position * [1, 1, -1]])
+
+    def delay(t):
+        ways = np.linalg.norm(q.position + np.multiply.outer(t, q.velocity) - images, axis=-1)
+        return (ways[..., :, None] + ways[..., None, :]).ravel() / SPEED_OF_LIGHT
+
+    h = 1e-4
+    before, now, after = (delay(t) for t in (-h, 0.0, h))
+    away = q.position - images
+    share = images[1, 2] / (images[1, 2] - q.position[2])
+    hit = images[1] + share * away[1]
+    unit = away / np.linalg.norm(away, axis=1)[:, None] * [[1, 1, 1], [1, 1, -1]]
+    nowhere = np.full(3, np.nan)
+    there, back = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
+    points = [
+        [hit if a else nowhere, q.position, hit if b else nowhere]
+        for a, b in zip(there, back, strict=True)
+    ]
+    return make_paths(
+        gain=1e-6 * (-0.8) ** (there + back),
+        delay=now,
+        delay_rate=(after - before) / (2 * h),
+        delay_accel=(after - 2 * now + before) / h**2,
+        departure=unit[there],
+        arrival=unit[back],
+        tx_radius=np.linalg.norm(away, axis=1)[there],
+        rx_radius=np.linalg.norm(away, axis=1)[back],
+        kind=np.where(there + back, PathKind.GHOST, PathKind.TARGET),
+        target=1,
+        bounces=there + back,
+        points=points,
+        faces=[[a - 1, -1, b - 1] for a, b in zip(there, back, strict=True)],
+        tx="radar",
+        rx="radar",
+        epoch=middle,
+        target_names=("radar", "Q"),
+    )
+
+
+def test_ground_multipath_is_the_sum_over_images_at_every_sample():
+    """Four paths to each point, 0.05 %. Planted bugs: `mirror` of one end for both; `points[:at]`
+    for `points[:at:-1]`; spreading of the way there alone."""
+    s = scenario(rotors={"number": 1, "arm_m": 0.1, "blade_length_m": 0.03}, chirps=12)
+    setup = irt.prepare(s)
+    frame, w, antennas = setup.frame(1), setup.waveform, setup.arrays.of("radar")
+    middle = setup.timetable.epoch(1)
+    paths = over_ground(frame, middle)
+    moving = setup.moving_centres.with_centres(paths, frame.poses, middle)
+    links = [(frame.sent["radar"], moving.select(np.arange(4, len(moving))))]
+    found = irt.if_signal(w, links, *frame._listening(OWN), irt.Direct()).samples
+    radar, q, sent = frame.poses["radar"], frame.poses["Q"], frame.sent["radar"]
+    body = blades_of(s.swarm["Q"].rotors, w, s.seed, "Q")
+    tx, rx = (
+        radar.position + radar.to_world(r) for r in (antennas.tx_positions, antennas.rx_positions)
+    )
+    section = setup.reference.sections["Q"].square_metres(*2 * [np.array([0.0, 1.0, 0.0])])
+    forward = q.velocity * [1, 1, 0] / np.hypot(*q.velocity[:2])
+    right = np.array([forward[1], -forward[0], 0.0])
+    flip = np.array([[1, 1, 1], [1, 1, -1]])
+    truth = np.zeros(found.shape, complex)
+    for p, k in np.ndindex(w.num_chirps, body.radius.size):
+        t = p * w.slot_duration + w.fast_time - w.frame_duration / 2
+        angle = body.phase[k] + body.turning[k] * (t + middle)
+        place = q.position + np.outer(t, q.velocity)
+        arm = np.outer(np.sin(angle), right) + np.outer(np.cos(angle), forward)
+        point = place + body.hub[k, 0] * right + body.hub[k, 1] * forward + body.radius[k] * arm
+        level = body.amplitude[k] / np.sqrt(section) * sent.amplitude * 1e-6
+
+        def way(element, image, point=point):
+            return np.linalg.norm(point - element * flip[image], axis=1)
+
+        spread = [
+            np.linalg.norm(place - radar.position * f, axis=1)
+            / np.linalg.norm(point - radar.position * f, axis=1)
+            for f in flip
+        ]
+        for r, a, b in np.ndindex(len(rx), 2, 2):
+            tau = (way(tx[sent.schedule[0, p]], a) + way(rx[r], b)) / SPEED_OF_LIGHT
+            wave = np.exp(2j * np.pi * w.phase(tau, w.fast_time))
+            truth[0, r, p] += level * (-0.8) ** (a + b) * spread[a] * spread[b] * wave
+    assert np.linalg.norm(found - truth) < 5e-4 * np.linalg.norm(truth)
+
+
+def test_blades_far_below_noise_are_left_out():
+    """Planted bug: `<` for `>` in `with_centres`."""
+    setup = irt.prepare(scenario(rotors={}))
+    frame, epoch = setup.frame(0), setup.timetable.epoch(0)
+    job = frame.paths[OWN], frame.poses, epoch
+    blades = setup.moving_centres.models[0][1].amplitude
+    power = frame.paths[OWN].power[0] * (blades**2).sum() / 0.1
+    assert len(setup.moving_centres.with_centres(*job, 0.9 * power)) > 1000
+    assert len(setup.moving_centres.with_centres(*job, 1.1 * power)) == 1
+
+
 def test_the_second_order_leaves_out_what_it_says():
     """Planted bug: `half**2` in `remainder`."""
     speed, rate, half = 75.4, 2 * np.pi * 100, 32e-6
