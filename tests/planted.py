@@ -500,6 +500,20 @@ OF_CASES = {
         "return Gospa(float(np.sqrt(square + missed + false))",
         "return Gospa(float(np.sqrt(square + missed))",
     ),
+    "attenuation by gas": Bug(
+        "extensions/street/air.py",
+        "(a5 + a6 * theta) * (p + e) * theta**0.8",
+        "(a5 + a6 * theta) * (p + e) * theta**0.7",
+    ),
+    "attenuation by rain": Bug("extensions/street/air.py", "np.cos(2 * tilt)", "np.cos(tilt)"),
+    "echoes of rain": Bug(
+        "extensions/street/weather.py", "weight = 8 * np.pi", "weight = 4 * np.pi"
+    ),
+    "foreign chirps": Bug(
+        "extensions/street/emitters.py",
+        "slope=w.slope - train.slope * speed**2",
+        "slope=w.slope + train.slope * speed**2",
+    ),
 }
 """For each case of `isac-rt validate` one bug with which it fails (``--planted``)."""
 

@@ -17,6 +17,7 @@ def all_cases(quick: bool = False) -> list[Case]:
         noise,
         receivers,
         signal,
+        street,
         tracking,
     )
     from truths.case import cases_of
@@ -31,6 +32,7 @@ def all_cases(quick: bool = False) -> list[Case]:
         tracking,
         measured,
         crosschecks,
+        street,
     )
     cases = [case for module in modules for case in cases_of(module)]
     return [case for case in cases if case.quick or not quick]

@@ -1,5 +1,5 @@
-"""Foreign radars: against a dechirp sample by sample at 20 times the rate, and what receivers make
-of them."""
+"""Foreign radars: their paths, chirps and what a frame adds of them; tests/truths/street.py has the
+dechirp at 20 times the rate."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from truths.street import START, WAVEFORM, one_path, receiver
 
 from isac_rt import runtime
 from isac_rt.document import ScenarioError
@@ -15,8 +16,8 @@ from isac_rt.extensions.street.emitters import Arrival, Train, add_foreign
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import ReceiveArray, Reference, Transmission
 from isac_rt.frame.payload import unmodulated
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.scenario.file import load
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Exact
@@ -25,130 +26,7 @@ from isac_rt.simulation.setup import prepare
 from isac_rt.world.swarm import Pose
 
 SCENE = Path(__file__).parents[3] / "scenes" / "foreign_radar.yaml"
-WAVEFORM = Waveform(num_samples=256, num_chirps=12, num_groups=2)
-START = 0.037
-OVERSAMPLING = 20
 OPEN = ["propagation.model=free_space", "clutter.model=none"]
-
-
-def one_path(delay: float = 150e-9) -> PathSet:
-    """Closing and accelerated, near enough for a spherical wave."""
-    along = np.array([[0.4, -0.9, np.sqrt(1 - 0.97)]])
-    return make_paths(
-        gain=[3e-5 * np.exp(1j)],
-        delay=[delay],
-        delay_rate=[-38 / SPEED_OF_LIGHT],
-        delay_accel=[300 / SPEED_OF_LIGHT],
-        departure=-along,
-        arrival=along,
-        rx_radius=[delay * SPEED_OF_LIGHT],
-        kind=PathKind.LINE_OF_SIGHT,
-        epoch=START + WAVEFORM.frame_duration / 2,
-        tx="E",
-        rx="A",
-    )
-
-
-def receiver() -> ReceiveArray:
-    antennas = Antennas(rx_x=3, rx_z=2, spacing=WAVEFORM.wavelength / 2)
-    return ReceiveArray(Pose.at_rest((0, 0, 5), (0.3, 1, 0)), antennas)
-
-
-def filtered(samples: np.ndarray, rate: float) -> np.ndarray:
-    """Samples at a high rate behind the IF filter: 1 on [0, f_s], raised cosines beyond."""
-    w = WAVEFORM
-    f = np.fft.fftfreq(samples.shape[-1], 1 / rate)
-    beyond = np.maximum(np.maximum(-f, f - w.sampling_rate), 0) / w.filter_transition
-    gain = np.where(beyond < 1, np.cos(np.pi * np.minimum(beyond, 1) / 2) ** 2, 0.0)
-    return np.fft.ifft(np.fft.fft(samples) * gain)
-
-
-def dechirped(train: Train, paths: PathSet, ear: ReceiveArray) -> np.ndarray:
-    """Samples (M, L_rx, P, N) of one path: both chirps at 20 times the rate with the true delay of
-    each element at each instant, multiplied, filtered, and every 20th taken."""
-    w, rate = WAVEFORM, OVERSAMPLING * WAVEFORM.sampling_rate
-    beyond = 400 * OVERSAMPLING  # 20 us before and after the samples
-    u = w.fast_time[0] + np.arange(-beyond, w.num_samples * OVERSAMPLING + beyond) / rate
-    source = float(paths.rx_radius[0]) * paths.arrival[0]
-    out = np.zeros((w.num_groups, ear.antennas.num_rx, w.num_chirps, w.num_samples), complex)
-    for m in range(w.num_groups):
-        for p in range(w.num_chirps):
-            time = START + w.chirp_time[m, p] + u
-            since = time - paths.epoch
-            delay = paths.delay[0] + paths.delay_rate[0] * since
-            delay = delay + paths.delay_accel[0] * since**2 / 2
-            for rx, place in enumerate(ear.pose.to_world(ear.antennas.rx_positions)):
-                farther = np.linalg.norm(source - place) - np.linalg.norm(source)
-                sent = time - delay - farther / SPEED_OF_LIGHT - train.offset
-                v = (sent + 1 / rate) % train.repetition - 1 / rate
-                phase = w.carrier_frequency * u + w.slope * u**2 / 2
-                phase = phase - train.frequency * v - train.slope * v**2 / 2
-                beat = w.carrier_frequency + w.slope * u - train.frequency - train.slope * v
-                # a band about the filter's, since what is far would alias at this rate too
-                off = np.abs(beat - w.sampling_rate / 2) / w.sampling_rate
-                wide = np.cos(np.pi / 2 * np.clip((off - 6) / 3, 0, 1)) ** 2
-                # the share of the step about each instant in which the chirp lasts
-                lasts = np.clip(np.minimum(v, train.duration - v) * rate + 0.5, 0, 1)
-                signal = np.exp(2j * np.pi * (phase % 1)) * lasts * wide
-                chosen = slice(beyond, beyond + w.num_samples * OVERSAMPLING, OVERSAMPLING)
-                out[m, rx, p] = filtered(signal, rate)[chosen]
-    return out * 2.0 * paths.gain[0].conj()
-
-
-def near_an_end(train: Train, paths: PathSet) -> np.ndarray:
-    """Mark the samples (M, P, N) within five samples of a foreign chirp's start or end."""
-    w = WAVEFORM
-    time = START + w.chirp_time[:, :, None] + w.fast_time
-    v = (time - paths.delay[0] - train.offset) % train.repetition
-    reach = 5 / w.sampling_rate
-    return (v < reach) | (v > train.repetition - reach) | (np.abs(v - train.duration) < reach)
-
-
-def train_of(slope: float, start: float, duration: float = 20e-6, idle: float = 3.3e-6) -> Train:
-    """Chirps of a slope over the receiver's, that start above its carrier [Hz]."""
-    w = WAVEFORM
-    return Train(
-        w.carrier_frequency + start, w.slope * slope, duration, duration + idle, 4.1e-6, None, 0.0
-    )
-
-
-SAME = Train(
-    WAVEFORM.carrier_frequency - 5e6,
-    WAVEFORM.slope * 1.0001,
-    WAVEFORM.chirp_duration * 1.3,
-    WAVEFORM.slot_duration,
-    START % WAVEFORM.slot_duration,
-    None,
-    0.0,
-)
-"""A tone of 11.6 MHz."""
-
-
-@pytest.mark.parametrize(
-    "train",
-    [
-        train_of(0.5, 100e6),
-        train_of(-0.8, 400e6),
-        train_of(1.7, -40e6),
-        train_of(1.02, 30e6, 15e-6),
-        SAME,
-    ],
-    ids=["slower", "falling", "steeper", "nearly the same", "the same to 1e-4"],
-)
-def test_crossings_are_those_of_a_dechirp_sample_by_sample(train):
-    """To 1e-3 of the largest sample; to 2e-2 at clicks where a foreign chirp begins or ends far
-    from the band, of which either has its own share. Planted bug: the sum of both slopes in the IF;
-    no delay rate within a chirp; the array's phases at the carrier; no folding of the skirts."""
-    ear, paths = receiver(), one_path()
-    truth = dechirped(train, paths, ear)
-    found = np.zeros(truth.shape, complex)
-    add_foreign(found, WAVEFORM, Arrival(train, 2.0, paths), ear, Reference(START))
-    largest = np.abs(truth).max()
-    assert largest > 5e-5  # it crosses
-    error = np.moveaxis(np.abs(found - truth), 1, 0) / largest
-    clicks = near_an_end(train, paths)
-    assert error[:, ~clicks].max() < 1e-3
-    assert error.max() < 2e-2
 
 
 def test_a_foreign_chirp_that_is_the_own_one_is_an_echo():

@@ -1,14 +1,14 @@
-"""Air and rain: tables of ITU-R, published series of Mie, the radar equation over the volume, and
-what a run makes of them."""
+"""Air and rain: published series of Mie, the integral over the volume, and what a run makes of
+them; tests/truths/street.py has the tables of ITU-R."""
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from truths.street import rain_of, rainy
 
 from isac_rt import runtime
 from isac_rt.document import ScenarioError
@@ -21,48 +21,20 @@ from isac_rt.extensions.street.drops import (
     mie_coefficients,
     permittivity,
 )
-from isac_rt.extensions.street.weather import Weathered
-from isac_rt.frame.antennas import Antennas, Arrays
+from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.propagation.free_space import FreeSpace
-from isac_rt.propagation.pathset import PathKind, PathSet
-from isac_rt.propagation.scatter_paths import LinkState
+from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.settings import Weather
 from isac_rt.scenario.file import load
 from isac_rt.simulation.audit import make_plan
 from isac_rt.simulation.setup import prepare
 from isac_rt.world.swarm import Pose
 
-DATA = Path(__file__).parent / "data"
 SCENE = Path(__file__).parents[3] / "scenes" / "rain.yaml"
 WAVEFORM = Waveform()
 F_C = WAVEFORM.effective_carrier
 RAIN = 10.0
-
-
-def table(name: str) -> list[list[str]]:
-    with (DATA / name).open(encoding="utf-8") as file:
-        return list(csv.reader(file))[2:]
-
-
-def test_gas_is_that_of_the_recommendation_to_its_last_digit():
-    """All 350 rows, 1 to 350 GHz, 14 digits. Planted bug: the interference of oxygen lines with
-    theta^0.7; p + e for the pressure of dry air."""
-    for row in table("ITURP676-13_gamma.csv"):
-        f, dry, kelvin, density, _, _, gamma = map(float, row)
-        found = gas_db_per_km(f * 1e9, kelvin, dry, density * kelvin / 216.7)
-        assert found == pytest.approx(gamma, rel=2e-14, abs=0), f
-
-
-def test_rain_is_that_of_the_recommendation_to_its_last_digit():
-    """Eight decimals of k, alpha and the attenuation. Planted bug: alpha_h and alpha_v without
-    their k; cos(tilt) for cos(2 tilt)."""
-    for row in table("ITURP838-3_rain_specific_attenuation.csv"):
-        elevation, f, rain, tilt, *said = map(float, row)
-        k, alpha = rain_coefficients(f * 1e9, np.radians(elevation), np.radians(tilt))
-        found = [float(k), float(alpha), float(k * rain**alpha)]
-        assert found == pytest.approx(said, abs=6e-9)
 
 
 def efficiencies(size: float, index: complex) -> np.ndarray:
@@ -122,45 +94,13 @@ def test_drops_attenuate_as_the_recommendation_says(frequency, rain):
     assert carried.sum() * 3.6e6 == pytest.approx(rain)
 
 
-def stage(
-    ends: dict[str, Pose], antennas: Antennas, settings: Weather | None = None
-) -> tuple[Weathered, FreeSpace]:
-    free = FreeSpace({}, Arrays(antennas), WAVEFORM.wavelength, 3)
-    settings = settings or Weather(rain_mm_per_h=RAIN)
-    return Weathered(settings, free, free, WAVEFORM, None), free
-
-
-def rain_of(weather: Weathered, link: Link, ends: dict[str, Pose], draws: int) -> list[PathSet]:
-    return [
-        weather.rain_paths(LinkState(link, float(t), ends[link.tx], ends[link.rx]))
-        for t in range(draws)
-    ]
-
-
-def test_power_of_rain_is_that_of_the_radar_equation():
-    """Own echoes of an isotropic antenna between two ranges: lambda^2 G^2 eta (1/r_1 - 1/r_2) / (16
-    pi^2). Planted bug: 8 pi for 4 pi in the weight of a scatterer; all draws of a thinned cell
-    counted once."""
-    ends = {"A": Pose.at_rest((3, 1, 20))}
-    weather, free = stage(ends, Antennas(gain=2.0))
-    found = rain_of(weather, Link("A", "A"), ends, 40)
-    for near, far in ((4, 10), (10, 20), (40, 80)):
-        power = [
-            p.power[(p.delay * SPEED_OF_LIGHT / 2 > near) & (p.delay * SPEED_OF_LIGHT / 2 < far)]
-            for p in found
-        ]
-        mean = np.concatenate(power).sum() / len(found)
-        said = free.wavelength**2 * 4 * weather.drops.reflectivity * (1 / near - 1 / far)
-        assert mean == pytest.approx(said / (16 * np.pi**2), rel=0.03, abs=0), near
-
-
 def test_power_of_rain_between_two_terminals_is_the_integral_over_the_volume():
     """A passive terminal 31 m away with fields of view: against uniform points in a box, all
     classes of drops at each. Planted bug: uniform in d for uniform in w; the wave after the drop
     from the receiver to it."""
     ends = {"A": Pose.at_rest((0, 0, 30)), "B": Pose.at_rest((6, 30, 25), boresight=(0.3, -1, 0))}
     antennas = Antennas(gain=1.0, pattern="sector", half_view=np.pi / 3)
-    weather, free = stage(ends, antennas)
+    weather, free = rainy(antennas)
     low, high, near = 33.0, 40.0, 8.0
     found = rain_of(weather, Link("A", "B"), ends, 40)
     power = np.zeros(2)  # near the transmitter, and all
@@ -206,7 +146,7 @@ def test_spectrum_of_rain_is_that_of_falling_drops():
     of the opposite sign."""
     ends = {"A": Pose.at_rest((0, 0, 2))}
     settings = Weather(rain_mm_per_h=RAIN, wind_mps=(3, 0, 0))
-    weather, _ = stage(ends, Antennas(), settings)
+    weather, _ = rainy(Antennas(), settings)
     found = rain_of(weather, Link("A", "A"), ends, 60)
     rate, up, east, power = (
         np.concatenate([get(p) for p in found])
@@ -233,7 +173,7 @@ def test_spectrum_of_rain_is_that_of_falling_drops():
 def test_a_frame_draws_rain_anew_and_the_same_frame_the_same():
     """Planted bug: the epoch left out of the generator's name."""
     ends = {"A": Pose.at_rest((0, 0, 2))}
-    weather, _ = stage(ends, Antennas())
+    weather, _ = rainy(Antennas())
     one, other = rain_of(weather, Link("A", "A"), ends, 2)
     again = rain_of(weather, Link("A", "A"), ends, 1)[0]
     assert np.array_equal(one.gain, again.gain) and np.array_equal(one.delay, again.delay)
