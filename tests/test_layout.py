@@ -244,7 +244,7 @@ MAX_LINES = {
     "receive": 6075,
     "track": 1946,
     "scenario": 2134,
-    "results": 3702,
+    "results": 3704,
     "simulation": 3691,
     "sweep": 2785,
     "views": 3582,

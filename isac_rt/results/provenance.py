@@ -107,8 +107,10 @@ def run_content(scenario: Scenario, snapshots: int, city: str | None = None) -> 
     """All that the results of a run depend on, as text; `city`: `city_digest`, where it is known
     already."""
     city = city_digest(scenario.city, scenario.folder) if city is None else city
-    board = scenario.calibration_path()
-    files = [city, "" if board is None else file_digest(board)]
+    files = [city]
+    for radio in (scenario.radio, *(u.radio for u in scenario.swarm.values() if u.radio)):
+        board = radio.calibration
+        files.append("" if board is None else file_digest(scenario.folder / board))
     return json.dumps(
         [scenario.model_dump(mode="json"), *files, program_fingerprint(), versions(), snapshots],
         sort_keys=True,

@@ -278,11 +278,13 @@ def ground_by(tree: dict[str, Any], files: Callable[[str, str | None], str]) -> 
     """The same, with what makes the digests of files."""
     of_files = ("source", "name", "file", "terrain")
     city = {k: v for k, v in (tree.get("city") or {}).items() if k in of_files}
+    radios = [tree.get("radio"), *(uav.get("radio") for uav in tree.get("swarm", {}).values())]
+    boards = [(radio or {}).get("calibration") for radio in radios]
     return {
         "program": program_fingerprint(),
         "versions": json.dumps(versions()),
         "city": files(json.dumps(city), None) if city else "",
-        "calibration": files("", (tree.get("radio") or {}).get("calibration")),
+        "calibration": "".join(files("", board) for board in boards),
     }
 
 

@@ -13,9 +13,12 @@ from oracles import mixed_chirps
 import isac_rt as irt
 from isac_rt.document import ScenarioError
 from isac_rt.frame.link import Link
+from isac_rt.results.provenance import run_content
 from isac_rt.scenario.file import folded_tree, to_yaml
+from isac_rt.settings import plain_tree
 from isac_rt.signal.if_signal import if_signal
 from isac_rt.signal.methods import Exact
+from isac_rt.sweep.definition import ground_of
 
 CHIRP = {"slope_mhz_per_us": 31.0, "idle_us": 5.0, "adc_start_us": 4.0, "ramp_end_us": 14.0}
 TREE = {
@@ -241,6 +244,20 @@ def test_a_radar_takes_its_boards_file(tmp_path):
     assert (radio.carrier_hz, radio.samples_per_chirp, radio.chirps_per_frame) == (77.5e9, 64, 32)
     assert scenario.frame_interval_s == TREE["frame_interval_s"]
     assert irt.prepare(scenario).of("B").waveform.slope == pytest.approx(30e12)
+
+
+def test_what_is_kept_depends_on_each_boards_calibration(tmp_path):
+    """One changed byte of one radar's file makes another run and another point of a sweep. Bug: the
+    common board's file alone."""
+    found = []
+    for text in ("one", "two"):
+        (tmp_path / "b.nc").write_text(text)
+        tree = changed("B", radio={"calibration": "b.nc"})
+        (tmp_path / "s.yaml").write_text(yaml.safe_dump(tree))
+        scenario = irt.load(tmp_path / "s.yaml")
+        found.append((run_content(scenario, 2), ground_of(plain_tree(scenario), tmp_path)))
+    assert found[0][0] != found[1][0]
+    assert found[0][1] != found[1][1]
 
 
 def test_sweeps_take_boards_as_values():
