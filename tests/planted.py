@@ -332,6 +332,26 @@ OF_CASES = {
     "noise does not know the order of work": Bug(
         "kernels/signal_noise.py", "a = uint32(low + uint32(i))", "a = uint32(i)"
     ),
+    "doppler edge of a rotor": Bug(
+        "extensions/street/centres.py",
+        "rate = (there.rate + back.rate) / SPEED_OF_LIGHT",
+        "rate = 2 * there.rate / SPEED_OF_LIGHT",
+    ),
+    "lines of a circling point": Bug(
+        "extensions/street/centres.py",
+        "longer = _dot(rho, rho - 2 * q)",
+        "longer = _dot(rho, rho - 2.0001 * q)",
+    ),
+    "blade of points": Bug(
+        "extensions/street/rotors.py",
+        "[0] + 1) // 2",
+        "[0] + 1) // 3",
+    ),
+    "cross section of a vehicle and an agv": Bug(
+        "extensions/street/extent.py",
+        "Lobe(180.0, 36.32, 79.65, 36.73, 14.56, 7.50)",
+        "Lobe(180.0, 36.32, 79.65, 36.73, 15.46, 8.40)",
+    ),
     "dpsk symbol errors": Bug(
         "receive/symbols.py",
         "product = chains[..., 1:] * chains[..., :-1].conj()",

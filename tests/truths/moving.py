@@ -1,0 +1,119 @@
+"""Moving scattering centres against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import jv
+
+from isac_rt.extensions.street.centres import MovingCentres
+from isac_rt.extensions.street.extent import KINDS
+from isac_rt.extensions.street.rotors import Blades, blade_points
+from isac_rt.frame.antennas import Antennas, Arrays
+from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
+from isac_rt.propagation.rcs import CrossSection, lobe_db
+from isac_rt.world.settings import Rcs, Uav
+from isac_rt.world.swarm import Pose, Swarm
+from truths.case import Errors, case
+
+
+def _circling(
+    w: Waveform, radius: float, turns: float, ends: np.ndarray, place: np.ndarray
+) -> PathSet:
+    """Paths over a point that circles about a UAV by so many turns a frame, without those of the
+    UAV."""
+    poses = {"A": Pose.at_rest(ends[0]), "B": Pose.at_rest(ends[1])}
+    legs = place - ends
+    length = np.linalg.norm(legs, axis=1)
+    echo = make_paths(
+        gain=[1.0],
+        delay=[length.sum() / SPEED_OF_LIGHT],
+        departure=legs[:1] / length[0],
+        arrival=legs[1:] / length[1],
+        kind=PathKind.TARGET,
+        target=0,
+        points=place[None, None],
+        faces=[[-1]],
+        tx="A",
+        rx="B",
+        epoch=0.0,
+        target_names=("U",),
+    )
+    swarm = Swarm({"U": Uav(role="target", position_m=(place[0], place[1], place[2]))})
+    turning = 2 * np.pi * turns / w.frame_duration
+    numbers = (np.array([v]) for v in (radius, 0.3, turning, 1.0))
+    point = Blades(np.zeros((1, 3)), *numbers)
+    sections = {"U": CrossSection(Rcs(model="constant", value_dbsm=0.0), "U", 1)}
+    arrays = Arrays(Antennas(tx_x=1, tx_z=1, rx_x=1, rx_z=1, spacing=0.0))
+    moving = MovingCentres(swarm, sections, w, arrays, [("U", point)])
+    paths = moving.with_centres(echo, poses | swarm.poses(0.0), 0.0)
+    return paths.select(np.arange(1, len(paths)))
+
+
+@case(
+    "2 v cos(beta/2) / lambda",
+    "2e-4 of the shift",
+    "the fastest of the slots' middles is up to 1 degree from the extreme",
+)
+def doppler_edge_of_a_rotor() -> Errors:
+    """The largest Doppler shift of a blade's tip, from one place and from two."""
+    w = Waveform(num_chirps=300, num_groups=1)
+    for across in (0.0, 700.0, 2000.0):
+        ends = np.array([[0.0, 0.0, 0.0], [across, 0.0, 0.0]])
+        paths = _circling(w, 0.12, 2.2, ends, np.array([0.0, 1000.0, 0.0]))
+        t = (np.maximum(paths.begin, -1) + np.minimum(paths.end, 1)) / 2
+        rate = paths.delay_rate + paths.delay_accel * t
+        speed = 2 * np.pi * 2.2 / w.frame_duration * 0.12
+        edge = 2 * speed * np.cos(np.arctan2(across, 1000.0) / 2) / w.wavelength
+        yield abs(np.abs(rate * w.carrier_frequency).max() / edge - 1)
+
+
+@case(
+    "Bessel functions: line n has the amplitude J_n(4 pi a / lambda)",
+    "1e-6 of the carrier",
+    "curvature of the wave over 1 cm at 1000 km, and delays of 7 ms in float64",
+)
+def lines_of_a_circling_point() -> Errors:
+    """The spectrum of a point that circles 37 times in a frame, folded by the slots."""
+    w, radius, turns = Waveform(num_chirps=255, num_groups=1), 0.01, 37
+    place = np.array([0.0, 1e6, 0.0])
+    paths = _circling(w, radius, turns, np.zeros((2, 3)), place)
+    slots = np.arange(w.num_chirps) * w.slot_duration - w.frame_duration / 2
+    t = slots + (w.window_start + w.chirp_duration) / 2
+    row = np.searchsorted(paths.begin, t, side="right") - 1
+    late = paths.delay[row] + (paths.delay_rate[row] + paths.delay_accel[row] * t / 2) * t
+    signal = np.exp(2j * np.pi * w.carrier_frequency * (late - 2e6 / SPEED_OF_LIGHT))
+    orders = np.arange(-40, 41)
+    lines = np.abs(np.fft.fft(signal))[orders * turns % 255] / signal.size
+    yield float(np.abs(lines - np.abs(jv(orders, 4 * np.pi * radius / w.wavelength))).max())
+
+
+@case("the integral over the wire, a sinc", "1e-5 of a flash", "bound of the number of points")
+def blade_of_points() -> Errors:
+    """The echo of a blade of points in all directions."""
+    for length in (0.03, 0.12, 0.4):
+        k = 2 * np.pi * 77.6e9 / SPEED_OF_LIGHT
+        place, weight = blade_points(length, k)
+        x = np.linspace(-1, 1, 997) * k * length
+        found = np.exp(2j * np.outer(x, place / length)) @ weight
+        yield float(np.abs(found - np.sinc(x / np.pi) * np.exp(1j * x)).max())
+
+
+@case(
+    "means over all aspects printed in TR 38.901 v19, table 7.9.2.1-4 and -6: 11.25, -4.25 dBsm",
+    "0.01 dB",
+    "the means are printed to two digits",
+)
+def cross_section_of_a_vehicle_and_an_agv() -> Errors:
+    """The largest lobe in each direction, averaged over the sphere."""
+    mu, weight = np.polynomial.legendre.leggauss(400)
+    phi = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    s = np.sqrt(1 - mu**2)[:, None]
+    height = np.broadcast_to(mu[:, None], (400, 720))
+    u = np.stack([s * np.cos(phi), s * np.sin(phi), height], axis=-1)
+    for kind, printed in (("vehicle", 11.25), ("agv", -4.25)):
+        lobes, constants = KINDS[kind].lobes, KINDS[kind].bistatic
+        largest = np.max(
+            [lobe_db(lobe, constants, u, np.zeros((400, 720))) for lobe in lobes], axis=0
+        )
+        yield abs(10 * np.log10((10 ** (largest / 10)).mean(axis=1) @ weight / 2) - printed)
