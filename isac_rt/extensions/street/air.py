@@ -14,7 +14,8 @@ References
 .. [1] ITU-R P.676-13, "Attenuation by atmospheric gases and related effects", annex 1, 1 to 1000
    GHz; the files lines_*.csv are its tables 1 and 2.
 .. [2] ITU-R P.838-3, "Specific attenuation model for rain for use in prediction methods", 1 to 1000
-   GHz; the constants are its tables 1 to 4.
+   GHz; rain_p838.csv holds the Gaussians of its tables 1
+   to 4, (a, b, c) over log10 of the frequency [GHz].
 """
 
 from __future__ import annotations
@@ -28,42 +29,13 @@ ZERO_CELSIUS = 273.15
 """[K]"""
 VAPOUR_CONSTANT = 216.7
 """Density of water vapour times temperature over its pressure [g K / (m^3 hPa)], P.676 eq. 4."""
-_GAUSSIANS = {
-    "k_h": (
-        (-5.33980, -0.10008, 1.13098),
-        (-0.35351, 1.26970, 0.45400),
-        (-0.23789, 0.86036, 0.15354),
-        (-0.94158, 0.64552, 0.16817),
-    ),
-    "k_v": (
-        (-3.80595, 0.56934, 0.81061),
-        (-3.44965, -0.22911, 0.51059),
-        (-0.39902, 0.73042, 0.11899),
-        (0.50167, 1.07319, 0.27195),
-    ),
-    "alpha_h": (
-        (-0.14318, 1.82442, -0.55187),
-        (0.29591, 0.77564, 0.19822),
-        (0.32177, 0.63773, 0.13164),
-        (-5.37610, -0.96230, 1.47828),
-        (16.1721, -3.29980, 3.43990),
-    ),
-    "alpha_v": (
-        (-0.07771, 2.33840, -0.76284),
-        (0.56727, 0.95545, 0.54039),
-        (-0.20238, 1.14520, 0.26809),
-        (-48.2991, 0.791669, 0.116226),
-        (48.5833, 0.791459, 0.116479),
-    ),
-}
-"""P.838: (a, b, c) of each Gaussian over log10 of the frequency [GHz]."""
 _LINES = {
     "k_h": (-0.18961, 0.71147),
     "k_v": (-0.16398, 0.63297),
     "alpha_h": (0.67849, -1.95537),
     "alpha_v": (-0.053739, 0.83433),
 }
-"""P.838: slope m and offset c of the straight line under them."""
+"""P.838: slope m and offset c of the straight line under the Gaussians."""
 
 
 def vapour_pressure(density: float, kelvin: float) -> float:
@@ -72,10 +44,15 @@ def vapour_pressure(density: float, kelvin: float) -> float:
 
 
 @cache
-def _lines(gas: str) -> np.ndarray:
-    """Return the columns of a table of lines."""
-    text = files(__package__).joinpath(f"lines_{gas}.csv").read_text()
-    return np.loadtxt(text.splitlines(), delimiter=",", skiprows=1).T
+def _table(name: str) -> np.ndarray:
+    """Return a table of this folder, with its columns by name."""
+    lines = files(__package__).joinpath(f"{name}.csv").read_text().splitlines()
+    return np.genfromtxt(lines, delimiter=",", names=True, dtype=None, encoding="utf-8")
+
+
+def _columns(name: str) -> tuple[np.ndarray, ...]:
+    table = _table(name)
+    return tuple(table[column].astype(float) for column in table.dtype.names or ())
 
 
 def gas_db_per_km(frequency: float, kelvin: float, dry: float, vapour: float) -> float:
@@ -87,13 +64,13 @@ def gas_db_per_km(frequency: float, kelvin: float, dry: float, vapour: float) ->
     dry, vapour : pressures of dry air and of water vapour [hPa]
     """
     f, p, e, theta = frequency / 1e9, dry, vapour, 300 / kelvin
-    line, a1, a2, a3, a4, a5, a6 = _lines("oxygen")
+    line, a1, a2, a3, a4, a5, a6 = _columns("lines_oxygen")
     strength = 1e-7 * a1 * p * theta**3 * np.exp(a2 * (1 - theta))
     width = 1e-4 * a3 * (p * theta ** (0.8 - a4) + 1.1 * e * theta)
     width = np.sqrt(width**2 + 2.25e-6)  # Zeeman splitting
     interference = 1e-4 * (a5 + a6 * theta) * (p + e) * theta**0.8
     total = (strength * _shape(f, line, width, interference)).sum()
-    line, b1, b2, b3, b4, b5, b6 = _lines("water_vapour")
+    line, b1, b2, b3, b4, b5, b6 = _columns("lines_water_vapour")
     strength = 0.1 * b1 * e * theta**3.5 * np.exp(b2 * (1 - theta))
     width = 1e-4 * b3 * (p * theta**b4 + b5 * e * theta**b6)
     width = 0.535 * width + np.sqrt(0.217 * width**2 + 2.1316e-12 * line**2 / theta)  # Doppler
@@ -125,10 +102,9 @@ def rain_coefficients(
     elevation : of the path [rad]
     tilt : of the polarisation against the horizontal [rad]; pi/2: vertical
     """
-    log = np.log10(frequency / 1e9)
-    value = {}
+    log, gaussians, value = np.log10(frequency / 1e9), _table("rain_p838"), {}
     for name, (slope, offset) in _LINES.items():
-        a, b, c = np.array(_GAUSSIANS[name]).T
+        a, b, c = (gaussians[gaussians["of"] == name][key] for key in "abc")
         value[name] = (a * np.exp(-(((log - b) / c) ** 2))).sum() + slope * log + offset
     k_h, k_v = 10 ** value["k_h"], 10 ** value["k_v"]
     turned = np.cos(elevation) ** 2 * np.cos(2 * tilt)

@@ -29,6 +29,7 @@ from isac_rt.propagation.settings import Weather
 from isac_rt.scenario.file import load
 from isac_rt.simulation.audit import make_plan
 from isac_rt.simulation.setup import prepare
+from isac_rt.simulation.simulate import run
 from isac_rt.world.swarm import Pose
 
 SCENE = Path(__file__).parents[3] / "scenes" / "rain.yaml"
@@ -256,3 +257,16 @@ def test_without_rain_there_are_no_more_paths():
     for link, paths in setup.find(0)[1].items():
         assert len(paths) == len(dry.find(0)[1][link])
         assert (np.abs(paths.gain) < np.abs(dry.find(0)[1][link].gain)).all()
+
+
+@pytest.mark.sionna
+def test_rain_in_a_street_brings_detections_of_no_target():
+    """Four frames of the scene: AT finds U1 among five times the clutter of dry air, PT1 decodes.
+    Planted bug: the rain's paths left out."""
+    wet, dry = (
+        run(load(SCENE, [*more, "frames=4"]), progress=False).summary["terminals"]
+        for more in ([], ["weather=null"])
+    )
+    assert wet["AT"]["targets"]["U1"]["found"] == dry["AT"]["targets"]["U1"]["found"] == 4
+    assert wet["AT"]["clutter_per_frame"] > 5 * dry["AT"]["clutter_per_frame"]
+    assert wet["PT1"]["ser_delay"] == 0
