@@ -334,9 +334,9 @@ class Document:
             raise ScenarioError(f"{option}: the value cannot be read: {message}") from None
         here, key = self._locate(parts, option)
         here[key[-1]] = value
-        for old in [place for place in self.places if place[: len(key)] == key]:
+        for old in [at for at in self.places if at[: len(key)] == key]:
             del self.places[old]
-        self.places |= {(*key, *place[len(key) :]): option for place in reader.places}
+        self.places |= {(*key, *at[len(key) :]): option for at in reader.places}
         self.places[key] = option
 
     def _locate(self, parts: list[str], option: str) -> tuple[Any, Key]:
@@ -387,16 +387,16 @@ class Document:
         try:
             tree = root.model_validate(self.data)
         except ValidationError as error:
-            found = [(_key_of(one), one) for one in error.errors()]
-            broken |= {str(key[0]) for key, _ in found if key}
-            for key, one in found:
+            errors = [(_key_of(error_of), error_of) for error_of in error.errors()]
+            broken |= {str(key[0]) for key, _ in errors if key}
+            for key, error_of in errors:
                 if (key or not broken) and not any(key[: len(of)] == of for of in without):
-                    for about, line in self._complaints(root, key, one):
+                    for about, line in self._complaints(root, key, error_of):
                         lines.setdefault(about, line)
         else:
             if not tables and not files:
                 return tree
-        beside = root.judged_beside(self.data, broken) if broken else []
+        beside = root.checked_together(self.data, broken) if broken else []
         lines |= {problem: self.complaint(problem) for problem in (*tables, *beside, *files)}
         raise ScenarioError(few_lines(list(lines.values())))
 
@@ -411,20 +411,20 @@ class Document:
         present = [key for key in keys if _at(self.data, key) is not _NOWHERE]
         anchor = [*options, *present, named][0]
         above = (anchor[:n] for n in range(len(anchor), -1, -1))
-        place = next(self.places[key] for key in above if key in self.places)
+        line = next(self.places[key] for key in above if key in self.places)
         value = _at(self.data, named)
         shown = "" if value is _NOWHERE or isinstance(value, dict) else f" = {_shown(value)}"
-        if not isinstance(place, str):
-            return f"{self.path}:{place}: {dotted(named)}{shown}: {text}"
-        named_already = place.startswith((f"--set {dotted(named)}=", f"--{dotted(named)} "))
-        return f"{place}: {text}" if named_already else f"{place}: {dotted(named)}{shown}: {text}"
+        if not isinstance(line, str):
+            return f"{self.path}:{line}: {dotted(named)}{shown}: {text}"
+        named_already = line.startswith((f"--set {dotted(named)}=", f"--{dotted(named)} "))
+        return f"{line}: {text}" if named_already else f"{line}: {dotted(named)}{shown}: {text}"
 
-    def _complaints(self, root: type[Node], key: Key, found: Any) -> list[tuple[Any, str]]:
+    def _complaints(self, root: type[Node], key: Key, error: Any) -> list[tuple[Any, str]]:
         """Return the complaints of a finding of a validation, each with what it is about."""
-        if found["type"] == "inconsistent":
-            return [((key, p), self.complaint(p, key)) for p in found["ctx"]["problems"]]
-        at = key[:-1] if found["type"] == "missing" and isinstance(key[-1], int) else key
-        return [(key, self._line([at], _said(root, key, found)))]
+        if error["type"] == "inconsistent":
+            return [((key, p), self.complaint(p, key)) for p in error["ctx"]["problems"]]
+        at = key[:-1] if error["type"] == "missing" and isinstance(key[-1], int) else key
+        return [(key, self._line([at], _said(root, key, error)))]
 
 
 def few_lines(lines: Sequence[str]) -> str:
@@ -433,9 +433,9 @@ def few_lines(lines: Sequence[str]) -> str:
     return "\n".join([*lines[:MAX_MESSAGES], *([f"... and {more} more"] if more > 0 else [])])
 
 
-def _key_of(found: Any) -> Key:
+def _key_of(error: Any) -> Key:
     """Return the key of what pydantic found."""
-    return tuple(part for part in found["loc"] if not _OF_A_TYPE.match(str(part)))
+    return tuple(part for part in error["loc"] if not _OF_A_TYPE.match(str(part)))
 
 
 def _said(root: type[Node], key: Key, found: Any) -> str:

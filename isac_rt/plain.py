@@ -113,9 +113,9 @@ class Stateful:
 
     def memory(self) -> dict[str, Any]:
         """Return what is carried over as a plain tree."""
-        own = self if is_dataclass(self) else self.state
-        kept = {} if own is None else {"state": plain(own)}
-        return kept | {name: one.memory() for name, one in self.parts.items() if one is not None}
+        state = self if is_dataclass(self) else self.state
+        tree = {} if state is None else {"state": plain(state)}
+        return tree | {name: one.memory() for name, one in self.parts.items() if one is not None}
 
     def restore(self, memory: Mapping[str, Any]) -> None:
         """Go on from a `memory`."""

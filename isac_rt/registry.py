@@ -36,8 +36,8 @@ class Registry:
 
     def installed(self) -> dict[str, EntryPoint]:
         """The parts of other packages by name."""
-        found = entry_points(group=f"isac_rt.{self.kind}")
-        return {part.name: part for part in found if part.name not in self.own}
+        entries = entry_points(group=f"isac_rt.{self.kind}")
+        return {part.name: part for part in entries if part.name not in self.own}
 
     def names(self) -> list[str]:
         """All names: this package's first, then the others' in alphabetical order."""

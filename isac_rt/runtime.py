@@ -108,9 +108,9 @@ def shut_out_working_folder() -> None:
 
 def _ask_glibc(function: str, *arguments: int) -> None:
     """Call a function of glibc; nothing with another C library."""
-    found = getattr(ctypes.CDLL(None), function, None)
-    if found is not None:
-        found(*arguments)
+    symbol = getattr(ctypes.CDLL(None), function, None)
+    if symbol is not None:
+        symbol(*arguments)
 
 
 class UserError(Exception):
@@ -329,10 +329,10 @@ def _find_llvm() -> Backend:
         if version is not None and _usable(int(version.split(".")[0])):
             return Backend("llvm", path, version)
         unfit.append(f"{path} ({f'LLVM {version}' if version else 'cannot be loaded'})")
-    found = f"only {', '.join(unfit)}" if unfit else "none"
+    candidates = f"only {', '.join(unfit)}" if unfit else "none"
     raise RuntimeProblem(
         f"no usable LLVM: the ray tracer (Dr.Jit 1.5) needs libLLVM {OLDEST_LLVM} to {NEWEST_LLVM} "
-        f"or an NVIDIA GPU; found {found}; "
+        f"or an NVIDIA GPU; found {candidates}; "
         f"{_INSTALL_LLVM}, or set DRJIT_LIBLLVM_PATH to one"
     )
 
@@ -453,8 +453,8 @@ def tracing_in_one_thread() -> Iterator[None]:
 
 
 def _check_python() -> Check:
-    found = ".".join(map(str, sys.version_info[:3]))
-    return Check("python", sys.version_info >= (3, 11), found, "use Python 3.11 or later")
+    version = ".".join(map(str, sys.version_info[:3]))
+    return Check("python", sys.version_info >= (3, 11), version, "use Python 3.11 or later")
 
 
 def _check_backend() -> Check:
@@ -510,9 +510,9 @@ def available_memory() -> float | None:
 
 def _check_memory() -> Check:
     memory = available_memory()
-    found = "unknown" if memory is None else f"{memory / 1e9:.1f} GB available"
+    size = "unknown" if memory is None else f"{memory / 1e9:.1f} GB available"
     remedy = f"free some memory: the largest scenes take up to {MEMORY_NEEDED / 1e9:.0f} GB"
-    return Check("memory", memory is None or memory >= MEMORY_NEEDED, found, remedy)
+    return Check("memory", memory is None or memory >= MEMORY_NEEDED, size, remedy)
 
 
 def _check_cores() -> Check:
@@ -531,14 +531,17 @@ def _check_cores() -> Check:
 
 
 def _check_packages(names: Iterable[str] = PACKAGES) -> Check:
-    found, missing = [], []
+    present, missing = [], []
     for name in names:
         try:
-            found.append(f"{name} {importlib.metadata.version(name)}")
+            present.append(f"{name} {importlib.metadata.version(name)}")
         except importlib.metadata.PackageNotFoundError:
             missing.append(name)
     return Check(
-        "packages", not missing, ", ".join(found), f"missing: {', '.join(missing)}; run make setup"
+        "packages",
+        not missing,
+        ", ".join(present),
+        f"missing: {', '.join(missing)}; run make setup",
     )
 
 
@@ -560,7 +563,7 @@ def doctor() -> list[Check]:
         _check_cores,
         _check_packages,
     )
-    return [look() for look in looks]
+    return [check() for check in looks]
 
 
 def main() -> int:

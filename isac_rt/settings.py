@@ -84,7 +84,7 @@ class Node(BaseModel):
         yield from ()
 
     @classmethod
-    def judged_beside(cls, data: Any, broken: Set[str]) -> list[Problem]:
+    def checked_together(cls, data: Any, broken: Set[str]) -> list[Problem]:
         """List contradictions between the fields of malformed data that are not `broken`."""
         return []
 

@@ -118,10 +118,10 @@ def is_own_folder(folder: Path) -> bool:
     return True
 
 
-def _fault_of(place: Path, is_last: bool) -> str | None:
+def _fault_of(path: Path, is_last: bool) -> str | None:
     """Who else may write a folder; None if nobody."""
-    status = os.lstat(place)
-    if status.st_uid not in (os.geteuid(), 0) and place != Path(place.anchor):
+    status = os.lstat(path)
+    if status.st_uid not in (os.geteuid(), 0) and path != Path(path.anchor):
         return f"belongs to {_name_of(status.st_uid)}"
     if stat.S_ISLNK(status.st_mode):
         return None
@@ -266,8 +266,8 @@ def save_data(file: Path, key: str, value: Any) -> None:
     StorageError  If the file cannot be written.
     """
     tree, arrays = pack(value)
-    body = tree.encode() + b"\n" + arrays
-    write_whole(file, _seal(key, body) + body)
+    data = tree.encode() + b"\n" + arrays
+    write_whole(file, _seal(key, data) + data)
 
 
 def load_data(file: Path, key: str) -> Any | None:
@@ -277,10 +277,10 @@ def load_data(file: Path, key: str) -> Any | None:
         content = read_whole(file)
     except OSError:
         return None
-    seal, _, body = content.partition(b"\n")
-    if seal + b"\n" != _seal(key, body):
+    seal, _, data = content.partition(b"\n")
+    if seal + b"\n" != _seal(key, data):
         return None
-    tree, _, arrays = body.partition(b"\n")
+    tree, _, arrays = data.partition(b"\n")
     try:
         return unpack(tree.decode(), arrays)
     except BAD_DATA:  # sealed, but not by `save_data`
@@ -306,13 +306,13 @@ def source_digest(folder: Path) -> str:
 
 @lru_cache(maxsize=1)
 def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
-            found[name] = importlib.metadata.version(name)
+            versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            versions[name] = "not installed"
+    return versions
 
 
 def versions() -> dict[str, str]:
@@ -336,11 +336,11 @@ class Store:
     def get(self, key: str) -> Any | None:
         """Return the data kept under a key; None where it is not (or no longer) here."""
         file = self._file(key)
-        found = load_data(file, key)
-        if found is not None:
+        data = load_data(file, key)
+        if data is not None:
             with suppress(OSError):
                 os.utime(file)
-        return found
+        return data
 
     def put(self, key: str, value: Any) -> None:
         """Keep data under a key; nothing, where the folder cannot be written."""
@@ -398,11 +398,11 @@ def cached(what: str, depends_on: Any, make: Callable[[], Any]) -> Any:
     store = Store(Path(named), ".data", CACHE_BYTES)
     tree, arrays = pack([what, depends_on, program_fingerprint(), versions()])
     key = hashlib.sha256(tree.encode() + b"\n" + arrays).hexdigest()
-    found = store.get(key)
-    if found is None:
-        found = make()
-        store.put(key, found)
-    return found
+    data = store.get(key)
+    if data is None:
+        data = make()
+        store.put(key, data)
+    return data
 
 
 def checksum(key: str, content: bytes) -> str:
@@ -459,8 +459,8 @@ def unpack(tree: str, arrays: bytes) -> Any:
     return json.loads(tree, object_hook=made)
 
 
-def _seal(key: str, body: bytes) -> bytes:
-    return f"isac_rt {key} {checksum(key, body)}\n".encode()
+def _seal(key: str, data: bytes) -> bytes:
+    return f"isac_rt {key} {checksum(key, data)}\n".encode()
 
 
 @contextmanager

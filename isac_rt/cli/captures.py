@@ -73,12 +73,12 @@ def import_(
 
     check_folder(out.parent)
     with working("reading the samples"):
-        found = _calibrated(_imported(file, description, format), calibration)
-        save_capture(found, out)
+        capture = _calibrated(_imported(file, description, format), calibration)
+        save_capture(capture, out)
         again = load_capture(out)
-    if (again.cube.samples != found.cube.samples).any():
+    if (again.cube.samples != capture.cube.samples).any():
         raise InputProblem(f"{out}: does not read back as it was written; is the disk sound?")
-    say(f"{out}: {found.cube!r}")
+    say(f"{out}: {capture.cube!r}")
 
 
 def calibrate(
@@ -121,17 +121,17 @@ def calibrate(
     cosines = math.cos(elevation) * math.sin(azimuth), math.sin(elevation)
     with working("fitting"):
         capture = _opened(cube, description)
-        found = fit(capture, cosines)
+        calibration = fit(capture, cosines)
         left = {}
         if capture.antennas is not None and cosines == (0, 0):
             left = dict(
-                zip(STEPS, unexplained_by(capture, found, list(STEPS.values())), strict=True)
+                zip(STEPS, unexplained_by(capture, calibration, list(STEPS.values())), strict=True)
             )
-    figures: dict[str, Any] = {name: getattr(found, name) for name in KEYS}
-    figures |= {"unexplained_by_db": left} | _per_channel(found)
+    figures: dict[str, Any] = {name: getattr(calibration, name) for name in KEYS}
+    figures |= {"unexplained_by_db": left} | _per_channel(calibration)
     text = json.dumps(figures, indent=1, allow_nan=False) + "\n"
     if out is not None:
-        save_calibration(found, out)
+        save_calibration(calibration, out)
     if json_file == STDOUT:
         typer.echo(text, nl=False)
         return
@@ -144,23 +144,26 @@ def calibrate(
     say(*([f"{out}: name it with --calibration"] if out is not None else []))
 
 
-def _per_channel(found: Any) -> dict[str, Any]:
+def _per_channel(calibration: Any) -> dict[str, Any]:
     """Gains, phases, delays and the sweep as lists, with their standard deviations."""
     import numpy as np
 
     out: dict[str, Any] = {}
     for end in ("rx", "tx"):
-        gain, spread = getattr(found, f"{end}_gain"), getattr(found, f"{end}_gain_std")
-        delay, late = getattr(found, f"{end}_delay"), getattr(found, f"{end}_delay_std")
+        gain, spread = getattr(calibration, f"{end}_gain"), getattr(calibration, f"{end}_gain_std")
+        delay, delay_std = (
+            getattr(calibration, f"{end}_delay"),
+            getattr(calibration, f"{end}_delay_std"),
+        )
         out[end] = {
             "gain_db": (20 * np.log10(np.abs(gain))).tolist(),
             "gain_std_db": (20 / math.log(10) / math.sqrt(2) * spread).tolist(),
             "phase_deg": np.rad2deg(np.angle(gain)).tolist(),
             "phase_std_deg": np.rad2deg(spread / math.sqrt(2)).tolist(),
             "delay_ps": (delay * 1e12).tolist(),
-            "delay_std_ps": (late * 1e12).tolist(),
+            "delay_std_ps": (delay_std * 1e12).tolist(),
         }
-    frequency, response, spread = found.sweep
+    frequency, response, spread = calibration.sweep
     out["sweep"] = {
         "frequency_hz": frequency.real.tolist(),
         "gain_db": (20 * np.log10(np.abs(response))).tolist(),
@@ -242,8 +245,8 @@ def _recorded(
         interval = described.frame_interval_ms * 1e-3
     if calibration is None:
         return frames, interval
-    found = load_calibration(calibration)
-    return Frames(len(frames), lambda k: apply(found, frames[k])), interval
+    corrections = load_calibration(calibration)
+    return Frames(len(frames), lambda k: apply(corrections, frames[k])), interval
 
 
 def _imported(file: Path, description: Path | None, format: str | None) -> Capture:

@@ -47,16 +47,16 @@ def say_table(
     it is too wide for the terminal, words wrap and the titles of numbers stand in several lines."""
 
     def made(wide: bool) -> Table:
-        found = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
+        table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
         for i, title in enumerate(titles):
             if i and numbers:
                 title = title if wide else title.replace(" ", "\n")
-                found.add_column(title, justify="right", no_wrap=True)
+                table.add_column(title, justify="right", no_wrap=True)
             else:
-                found.add_column(title, overflow="fold", no_wrap=wide, min_width=9)
+                table.add_column(title, overflow="fold", no_wrap=wide, min_width=9)
         for row in rows:
-            found.add_row(*row)
-        return found
+            table.add_row(*row)
+        return table
 
     console = out()
     wide = made(True)

@@ -37,7 +37,7 @@ def ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
     from isac_rt.simulation.resume import FILE, ResumeError
     from isac_rt.storage import abandon
 
-    kept = folder / FILE
+    saved = folder / FILE
     receive, send = os.pipe()
     os.set_blocking(send, False)
 
@@ -49,7 +49,7 @@ def ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
             return
         time.sleep(_GRACE)
         abandon()
-        _say_kept(kept)
+        _say_kept(saved)
         say_interrupted()
         os._exit(128 + received[0])
 
@@ -63,7 +63,7 @@ def ending_soon_after_interrupt(folder: Path) -> Iterator[None]:
         yield
     except BaseException as problem:
         if not isinstance(problem, ResumeError):
-            _say_kept(kept)
+            _say_kept(saved)
         raise
     finally:
         sys.unraisablehook = hook

@@ -94,6 +94,6 @@ def new(
         files, notes = write_starter(file, wanted), tuple[str, ...]()
     if city is not None:
         with working("drawing the scene"):
-            picture, notes = write_picture(file)
-            files.append(picture)
+            image, notes = write_picture(file)
+            files.append(image)
     say(*files, *notes)

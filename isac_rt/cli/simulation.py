@@ -237,12 +237,12 @@ def _say_summary(results: Results) -> None:
             block["false_tracks"],
         )
     out().print(tables.legend(*shown))
-    found = ", ".join(
+    outcomes = ", ".join(
         f"{n:,} {kind.replace('_', ' ')}" for kind, n in summary["paths"].items() if n
     )
     seconds = summary["timing_s"]
     spent = f"{tables.number(seconds['total'])} s of processor time"
-    say(f"paths: {found}; {spent}, {tables.number(seconds['wall']['total'])} s elapsed")
+    say(f"paths: {outcomes}; {spent}, {tables.number(seconds['wall']['total'])} s elapsed")
 
 
 def _say_causes(whole: str, parts: Mapping[str, float]) -> None:
@@ -268,17 +268,17 @@ def plan(
         from isac_rt.simulation.setup import prepare
 
         setup = prepare(loaded)
-        found = make_plan(setup)
+        planned = make_plan(setup)
     if as_json:
-        typer.echo(json.dumps(found | {"city": setup.city.record()}, indent=1))
+        typer.echo(json.dumps(planned | {"city": setup.city.record()}, indent=1))
     else:
         _say_city(setup.city.notes)
-        _say_plan(found)
+        _say_plan(planned)
 
 
-def _say_plan(found: dict[str, Any]) -> None:
+def _say_plan(planned: dict[str, Any]) -> None:
     """The plan of `isac_rt.simulation.audit.make_plan`."""
-    _say_coverage(found["coverage"])
+    _say_coverage(planned["coverage"])
 
     def error(item: dict[str, Any]) -> str:
         value = item["estimate"]
@@ -292,17 +292,17 @@ def _say_plan(found: dict[str, Any]) -> None:
             item["left_out"],
             error(item),
         )
-        for item in found["items"]
+        for item in planned["items"]
     ]
     say_table(("", "link", "modelled", "left out", "error"), rows, numbers=False)
     out().print(_PLAN_WORDS)
     settled = {
-        "phase error at most [rad]": found["max_phase_error_rad"],
-        "weakest [dB under the noise of a cell]": found["weakest_path_db"],
-        "reach [m]": found["reach_m"],
+        "phase error at most [rad]": planned["max_phase_error_rad"],
+        "weakest [dB under the noise of a cell]": planned["weakest_path_db"],
+        "reach [m]": planned["reach_m"],
     }
     message = ", ".join(f"{name}: {value}" for name, value in settled.items() if value is not None)
-    say(f"preset {found['preset']}; {message}")
+    say(f"preset {planned['preset']}; {message}")
 
 
 def paths(

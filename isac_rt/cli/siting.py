@@ -134,7 +134,7 @@ def _ranked(heights: _Map, formation: Formation) -> Iterator[Site]:
     rows, columns = np.unravel_index(chosen, rise.shape)
     middles = heights.corner + (np.column_stack([columns, rows]) + 0.5) * heights.cell
     corridor, (ahead, near) = _corridor(formation), _ahead(formation)
-    found = []
+    sites = []
     for number in range(_HEADINGS):
         heading = 2 * np.pi * number / _HEADINGS
         rotate = Site(np.zeros(3), heading).rotate
@@ -148,12 +148,12 @@ def _ranked(heights: _Map, formation: Formation) -> Iterator[Site]:
         nearest = (walls * near).max(axis=1)  # few buildings fill little of the view from anywhere
         score = (0.05 + np.minimum(walls.mean(axis=1), 0.3)) * (0.1 + nearest)
         score *= (1.0 + 2.0 * street) * share[rows, columns]
-        found += [
+        sites += [
             (-score[k], Site(np.append(middles[k], z[k]), heading))
             for k in np.flatnonzero(np.isfinite(z))
         ]
-    found.sort(key=lambda item: item[0])
-    yield from (site for _, site in found[:_TRIED])
+    sites.sort(key=lambda item: item[0])
+    yield from (site for _, site in sites[:_TRIED])
 
 
 def _corridor(formation: Formation) -> NDArray[np.float64]:

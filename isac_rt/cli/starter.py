@@ -102,11 +102,11 @@ def _targets(wanted: Wanted) -> tuple[float, dict[str, dict[str, Any]]]:
         return uav | ({"formation": size} if count > 1 else {})
 
     ahead = 0.0 if wanted.formation == "line" else half
-    found = {"U": group(wanted.uavs - crossing, [0.0, begun + ahead, 0.0], [0, _TARGET_SPEED, 0])}
+    targets = {"U": group(wanted.uavs - crossing, [0.0, begun + ahead, 0.0], [0, _TARGET_SPEED, 0])}
     if crossing:  # between the others, and higher
         side = begun + _SPACING_M * crossing / 2
-        found["V"] = group(crossing, [side, 0.0, 2.0], [_TARGET_SPEED, 0, 0])
-    return half, found
+        targets["V"] = group(crossing, [side, 0.0, 2.0], [_TARGET_SPEED, 0, 0])
+    return half, targets
 
 
 def _flights(swarm: dict[str, dict[str, Any]]) -> Formation:
@@ -195,9 +195,9 @@ def write_picture(file: Path) -> tuple[Path, tuple[str, ...]]:
     scenario = load(file)
     city, swarm = city_of(scenario, DRAWN_M), swarm_of(scenario)
     times = np.linspace(0.0, _DURATION_S, 30)
-    picture = file.with_suffix(".png")
-    write_view(view_scene(city, swarm, times, 0.0, {}), picture)
-    return picture, city.notes
+    image = file.with_suffix(".png")
+    write_view(view_scene(city, swarm, times, 0.0, {}), image)
+    return image, city.notes
 
 
 def _keys(wanted: Wanted, folder: Path) -> dict[str, str]:

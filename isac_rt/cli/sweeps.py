@@ -108,15 +108,17 @@ def _finish(plan: Plan, folder: Path) -> None:
 def _say_status(folder: Path) -> None:
     from isac_rt.sweep import status
 
-    found = status(folder)
-    left = found.total - found.done - found.failed
-    say(f"{found.done} of {found.total} points done, {found.failed} failed, {left} to do")
-    say(*(f"  failed at {list(index)}: {error.splitlines()[0]}" for index, error in found.errors))
-    if found.failed:
+    progress = status(folder)
+    left = progress.total - progress.done - progress.failed
+    say(f"{progress.done} of {progress.total} points done, {progress.failed} failed, {left} to do")
+    say(
+        *(f"  failed at {list(index)}: {error.splitlines()[0]}" for index, error in progress.errors)
+    )
+    if progress.failed:
         say("  --retry-failed runs them again")
     for count, cause in (
-        (found.other_version, "by another version of isac_rt or of its packages"),
-        (found.other_scenario, "for other values of the scenario or of its files"),
+        (progress.other_version, "by another version of isac_rt or of its packages"),
+        (progress.other_scenario, "for other values of the scenario or of its files"),
     ):
         if count:
             say(f"  {count} more in the folder were computed {cause} and are not used")

@@ -97,7 +97,7 @@ class Board:
         used = self._numbered()
         array: dict[str, Any] = {"rx": {"shape": "linear", "columns": self.receivers}}
         if max(self.chirps) < len(TI_TX):
-            places = [list(place) for place in self._places()]
+            places = [list(position) for position in self._places()]
             array["tx"] = {"shape": "positions", "positions": places}
         else:
             array["tx"] = {"shape": "linear", "columns": max(used) + 1}
@@ -165,12 +165,12 @@ class _Place(NamedTuple):
     def number(self, value: Any, what: str, least: float, most: float) -> float:
         """A number within limits."""
         try:
-            found = float(int(value, 0) if str(value).lower().startswith("0x") else value)
+            parsed = float(int(value, 0) if str(value).lower().startswith("0x") else value)
         except (TypeError, ValueError):
             raise self.fail(f"{what} is {str(value)[:40]!r}, no number") from None
-        if not least <= found <= most:
-            raise self.fail(f"{what} is {found:g}, it must be {least:g} to {most:g}")
-        return found
+        if not least <= parsed <= most:
+            raise self.fail(f"{what} is {parsed:g}, it must be {least:g} to {most:g}")
+        return parsed
 
 
 _LIMITS = {
@@ -196,12 +196,14 @@ def _board(
     first, last, loops, frames, period = frame
     order: list[int] = []
     for k in range(first, last + 1):
-        found = [c for c in chirps if c.first <= k <= c.last]
-        if len(found) != 1:
-            raise place.fail(f"chirp {k} of the frame is configured {len(found)} times, not once")
-        if found[0].profile != chirps[0].profile:
+        matching = [c for c in chirps if c.first <= k <= c.last]
+        if len(matching) != 1:
+            raise place.fail(
+                f"chirp {k} of the frame is configured {len(matching)} times, not once"
+            )
+        if matching[0].profile != chirps[0].profile:
             raise place.fail(f"chirp {k} has another profile; let all chirps have one")
-        mask = found[0].mask
+        mask = matching[0].mask
         if mask <= 0 or mask & (mask - 1):
             raise place.fail(
                 f"chirp {k} switches {mask.bit_count()} transmitters on; let each chirp have one"
@@ -255,10 +257,10 @@ def _of_cfg(file: Path, text: str) -> Board:
         return found
 
     def one(command: str, least: int) -> tuple[_Place, list[str]]:
-        found = all_of(command, least)
-        if not found:
+        matching = all_of(command, least)
+        if not matching:
             raise BoardFileError(f"{file}: has no {command}; give the board's whole configuration")
-        return found[0]
+        return matching[0]
 
     whole = _Place(file, "")
     at, words = one("profileCfg", 14)

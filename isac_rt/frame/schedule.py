@@ -82,7 +82,7 @@ def _hadamard_rows(num_tx: int, size: int) -> tuple[int, ...]:
     left = list(range(1, size))
     for _ in range(num_tx - 1):
         added = [image + 2 * lines[[r ^ s for s in rows]].sum(axis=0) for r in left]
-        best = int(np.argmin([one.max().round(9) for one in added]))
+        best = int(np.argmin([row.max().round(9) for row in added]))
         rows.append(left.pop(best))
         image = added[best]
     return tuple(rows)

@@ -142,8 +142,8 @@ class Timetable:
     @cached_property
     def all_links(self) -> list[Link]:
         """Every link that is received at some time, in the order of first use."""
-        found = (link for first, _, _ in self._stretches for link in self._links(first, own=True))
-        return list(dict.fromkeys(found))
+        links = (link for first, _, _ in self._stretches for link in self._links(first, own=True))
+        return list(dict.fromkeys(links))
 
     @cached_property
     def labels(self) -> dict[Link, str]:

@@ -234,8 +234,8 @@ class Waveform:
 
     def check_sums(self, dpsk_order: int) -> list[tuple[int, ...]]:
         """Return the groups of each check sum; those with no bit besides have none."""
-        each = self.bits_per_frame(dpsk_order) // self.num_groups
-        return [groups for groups in self._checked if len(groups) * each > CHECK_BITS]
+        bits = self.bits_per_frame(dpsk_order) // self.num_groups
+        return [groups for groups in self._checked if len(groups) * bits > CHECK_BITS]
 
     def payload_bits(self, dpsk_order: int) -> int:
         """Bits of a frame that are left beside its check sums."""

@@ -40,19 +40,19 @@ FARTHEST_M = 1e5
 
 def doubts(scenario: Scenario) -> Iterator[Problem]:
     """List what a person should be asked about a scenario, equal doubts as one."""
-    found: dict[str, list[Key]] = {}
+    by_doubt: dict[str, list[Key]] = {}
     for doubt in (*_doubts_of_keys(scenario), *_doubts_of_flights(scenario)):
-        found.setdefault(doubt.text, []).extend(doubt.keys)
-    for text, keys in found.items():
+        by_doubt.setdefault(doubt.text, []).extend(doubt.keys)
+    for text, keys in by_doubt.items():
         others = list(dict.fromkeys(str(key[1]) for key in keys if key[0] == "swarm"))[1:]
         likewise = f" (likewise {', '.join(others)})" if others else ""
         yield Problem(tuple(keys), text + likewise)
 
 
 def _doubts_of_keys(scenario: Scenario) -> Iterator[Problem]:
-    for one in scenario.by_chirp():
-        for (a, first), (b, second) in combinations(one.first_blocks().items(), 2):
-            if abs(first - second) < one.radio.groups:
+    for part in scenario.by_chirp():
+        for (a, first), (b, second) in combinations(part.first_blocks().items(), 2):
+            if abs(first - second) < part.radio.groups:
                 message = f"{b} and {a} send in the same resource blocks; shall they collide?"
                 yield Problem((("swarm", b, "resource_block"),), message)
     for key, (low, high, unit) in PLAUSIBLE.items():

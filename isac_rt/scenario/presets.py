@@ -90,8 +90,8 @@ def _without_idle(filled: dict[str, Any], stated: dict[str, Any]) -> dict[str, A
     was."""
     idle = {
         key
-        for key, (other, values) in COUNTS_WITH.items()
-        if other in stated and stated[other] not in values
+        for key, (needed, values) in COUNTS_WITH.items()
+        if needed in stated and stated[needed] not in values
     }
     start, usual = filled.get("false_alarm_rate"), filled.get("update_false_alarm_rate")
     if isinstance(start, int | float) and isinstance(usual, int | float) and usual < start:

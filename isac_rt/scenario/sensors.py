@@ -166,7 +166,7 @@ def completed(stated: dict[str, Any], defaults: dict[str, dict[str, Any]]) -> di
     """Return settings with what a sensor says under the keys that are stated."""
     out = dict(stated)
     for key, values in defaults.items():
-        own = stated.get(key, {})
-        if isinstance(own, dict):
-            out[key] = {**values, **own}
+        given = stated.get(key, {})
+        if isinstance(given, dict):
+            out[key] = {**values, **given}
     return out

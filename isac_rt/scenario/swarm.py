@@ -56,8 +56,8 @@ def unfolded(swarm: dict[Any, Any]) -> dict[Any, Any]:
     stays as it is, for whoever checks it."""
     out: dict[Any, Any] = {}
     for name, uav in swarm.items():
-        found = _members(name, uav) if isinstance(uav, dict) and uav.get("formation") else None
-        for key, one in ({name: uav} if found is None else found).items():
+        members = _members(name, uav) if isinstance(uav, dict) and uav.get("formation") else None
+        for key, one in ({name: uav} if members is None else members).items():
             if key in out or (key != name and key in swarm):
                 raise ValueError(f"swarm.{name}.formation: there is a {key} already; rename one")
             out[key] = one
@@ -109,8 +109,8 @@ def _heading(uav: Uav) -> tuple[float, float]:
 def _moved(uav: dict[str, Any], east: float, north: float) -> dict[str, Any]:
     """A UAV as plain values, somewhere else."""
 
-    def beside(place: Any) -> list[float]:
-        return [place[0] + east, place[1] + north, place[2]]
+    def beside(point: Any) -> list[float]:
+        return [point[0] + east, point[1] + north, point[2]]
 
     out = dict(uav)
     if out.get("position_m") is not None:

@@ -91,7 +91,7 @@ def read_csv(
     lines, mark, header = opened(path)
     if otherwise and set(otherwise) <= set(header):
         needed = otherwise
-    known = {*needed, *optional}
+    names = {*needed, *optional}
     if missing := [name for name in needed if name not in header]:
         wanted = ", ".join((*needed, *(f"[{name}]" for name in optional)))
         wanted += f" or {', '.join(otherwise)}" if otherwise else ""
@@ -99,7 +99,7 @@ def read_csv(
             f"line {lines[0][0]}: no column {missing[0]}; its header must be {wanted}, not "
             f"{', '.join(header)[:80]!r}"
         )
-    if strange := [name for name in header if name not in known or header.count(name) > 1]:
+    if strange := [name for name in header if name not in names or header.count(name) > 1]:
         raise ValueError(f"line {lines[0][0]}: the column {strange[0][:40]!r} is not known here")
     if len(lines) > most + 1:
         raise ValueError(f"has {len(lines) - 1} rows, at most {most} are read; thin it out")
@@ -304,8 +304,8 @@ def by_aspect(unit: str) -> Reader:
 
 
 def _pattern(path: Path) -> dict[str, Any]:
-    found: dict[str, Any] = extension("antenna_pattern")(path)
-    return found
+    pattern: dict[str, Any] = extension("antenna_pattern")(path)
+    return pattern
 
 
 def _tables_of(tree: dict[str, Any], folder: Path) -> Iterator[tuple[Key, str, Reader]]:
@@ -356,8 +356,8 @@ def with_tables(
             out = copy.deepcopy(tree)
             here = _at(out, key)
         try:
-            found = reader(folder / file)
-            double = [k for k in found if here.get(k) is not None]
+            table = reader(folder / file)
+            double = [k for k in table if here.get(k) is not None]
             if double and not replace:
                 raise ValueError(f"stands beside {double[0]}; leave one of the two out")
         except ValueError as problem:
@@ -366,7 +366,7 @@ def with_tables(
             faults.append(Problem(((*key, name),), str(problem)))
             continue
         del here[name]
-        here.update(found)
+        here.update(table)
     return out
 
 

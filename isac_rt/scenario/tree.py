@@ -308,7 +308,7 @@ class Scenario(Node):
         )
 
     @classmethod
-    def judged_beside(cls, data: Any, broken: Set[str]) -> list[Problem]:
+    def checked_together(cls, data: Any, broken: Set[str]) -> list[Problem]:
         """List what the rules find that read none of the `broken` nodes."""
         prepared, values = _with_presets(data), {}
         for name, field in cls.model_fields.items():
@@ -318,12 +318,12 @@ class Scenario(Node):
         scenario = cls.model_construct(**values)
         for name in broken & cls.model_fields.keys():
             scenario.__dict__.pop(name, None)  # whoever reads it meets an AttributeError
-        found: list[Problem] = []
+        problems: list[Problem] = []
         for rule in scenario._rules():
             with suppress(AttributeError):
                 for problem in rule():
-                    found.append(problem)
-        return found
+                    problems.append(problem)
+        return problems
 
     def _slot_problems(self) -> Iterator[Problem]:
         sizes = (("array", "tx_x"), ("array", "tx_z"))
@@ -863,7 +863,7 @@ def _docstrings(node: type[Node]) -> dict[str, str]:
     The source is read here, for the schema alone: pydantic's `use_attribute_docstrings` does it for
     each model at every import.
     """
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for kind in (kind for kind in reversed(node.__mro__) if issubclass(kind, Node)):
         parsed = ast.walk(ast.parse(textwrap.dedent(inspect.getsource(kind))))
         definition = next(part for part in parsed if isinstance(part, ast.ClassDef))
@@ -873,5 +873,5 @@ def _docstrings(node: type[Node]) -> dict[str, str]:
                     ast.AnnAssign(target=ast.Name(id=field)),
                     ast.Expr(value=ast.Constant(value=str(text))),
                 ):
-                    found[field] = text
-    return found
+                    texts[field] = text
+    return texts

@@ -40,15 +40,15 @@ def croissant(
     splits : of each its shards: file, bytes and SHA-256 of a tar
     keep : parts of every sample
     """
-    shards = [shard for one in splits.values() for shard in one]
+    shards = [shard for names in splits.values() for shard in names]
     sets = [
-        _file_set(f"{split}-{part}", f"*.{part}.npy", "application/x-npy", one)
-        for split, one in splits.items()
+        _file_set(f"{split}-{part}", f"*.{part}.npy", "application/x-npy", names)
+        for split, names in splits.items()
         for part in keep
     ]
     truth = [
-        _file_set(f"{split}-truth", "*.json", "application/json", one)
-        for split, one in splits.items()
+        _file_set(f"{split}-truth", "*.json", "application/json", names)
+        for split, names in splits.items()
     ]
     return {
         "@context": CONTEXT,
@@ -56,7 +56,7 @@ def croissant(
         "conformsTo": "http://mlcommons.org/croissant/1.0",
         **about,
         "distribution": [*map(_shard, shards), *truth, *sets],
-        "recordSet": [_records(split) for split, one in splits.items() if one],
+        "recordSet": [_records(split) for split, names in splits.items() if names],
     }
 
 
