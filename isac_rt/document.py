@@ -387,11 +387,11 @@ class Document:
         try:
             tree = root.model_validate(self.data)
         except ValidationError as error:
-            errors = [(_key_of(error_of), error_of) for error_of in error.errors()]
+            errors = [(_key_of(fault), fault) for fault in error.errors()]
             broken |= {str(key[0]) for key, _ in errors if key}
-            for key, error_of in errors:
+            for key, fault in errors:
                 if (key or not broken) and not any(key[: len(of)] == of for of in without):
-                    for about, line in self._complaints(root, key, error_of):
+                    for about, line in self._complaints(root, key, fault):
                         lines.setdefault(about, line)
         else:
             if not tables and not files:

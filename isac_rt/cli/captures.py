@@ -144,26 +144,23 @@ def calibrate(
     say(*([f"{out}: name it with --calibration"] if out is not None else []))
 
 
-def _per_channel(calibration: Any) -> dict[str, Any]:
+def _per_channel(board: Any) -> dict[str, Any]:
     """Gains, phases, delays and the sweep as lists, with their standard deviations."""
     import numpy as np
 
     out: dict[str, Any] = {}
     for end in ("rx", "tx"):
-        gain, spread = getattr(calibration, f"{end}_gain"), getattr(calibration, f"{end}_gain_std")
-        delay, delay_std = (
-            getattr(calibration, f"{end}_delay"),
-            getattr(calibration, f"{end}_delay_std"),
-        )
+        gain, spread = getattr(board, f"{end}_gain"), getattr(board, f"{end}_gain_std")
+        delay, std = getattr(board, f"{end}_delay"), getattr(board, f"{end}_delay_std")
         out[end] = {
             "gain_db": (20 * np.log10(np.abs(gain))).tolist(),
             "gain_std_db": (20 / math.log(10) / math.sqrt(2) * spread).tolist(),
             "phase_deg": np.rad2deg(np.angle(gain)).tolist(),
             "phase_std_deg": np.rad2deg(spread / math.sqrt(2)).tolist(),
             "delay_ps": (delay * 1e12).tolist(),
-            "delay_std_ps": (delay_std * 1e12).tolist(),
+            "delay_std_ps": (std * 1e12).tolist(),
         }
-    frequency, response, spread = calibration.sweep
+    frequency, response, spread = board.sweep
     out["sweep"] = {
         "frequency_hz": frequency.real.tolist(),
         "gain_db": (20 * np.log10(np.abs(response))).tolist(),

@@ -108,17 +108,15 @@ def _finish(plan: Plan, folder: Path) -> None:
 def _say_status(folder: Path) -> None:
     from isac_rt.sweep import status
 
-    progress = status(folder)
-    left = progress.total - progress.done - progress.failed
-    say(f"{progress.done} of {progress.total} points done, {progress.failed} failed, {left} to do")
-    say(
-        *(f"  failed at {list(index)}: {error.splitlines()[0]}" for index, error in progress.errors)
-    )
-    if progress.failed:
+    state = status(folder)
+    left = state.total - state.done - state.failed
+    say(f"{state.done} of {state.total} points done, {state.failed} failed, {left} to do")
+    say(*(f"  failed at {list(index)}: {error.splitlines()[0]}" for index, error in state.errors))
+    if state.failed:
         say("  --retry-failed runs them again")
     for count, cause in (
-        (progress.other_version, "by another version of isac_rt or of its packages"),
-        (progress.other_scenario, "for other values of the scenario or of its files"),
+        (state.other_version, "by another version of isac_rt or of its packages"),
+        (state.other_scenario, "for other values of the scenario or of its files"),
     ):
         if count:
             say(f"  {count} more in the folder were computed {cause} and are not used")

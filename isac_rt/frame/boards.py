@@ -196,14 +196,12 @@ def _board(
     first, last, loops, frames, period = frame
     order: list[int] = []
     for k in range(first, last + 1):
-        matching = [c for c in chirps if c.first <= k <= c.last]
-        if len(matching) != 1:
-            raise place.fail(
-                f"chirp {k} of the frame is configured {len(matching)} times, not once"
-            )
-        if matching[0].profile != chirps[0].profile:
+        match = [c for c in chirps if c.first <= k <= c.last]
+        if len(match) != 1:
+            raise place.fail(f"chirp {k} of the frame is configured {len(match)} times, not once")
+        if match[0].profile != chirps[0].profile:
             raise place.fail(f"chirp {k} has another profile; let all chirps have one")
-        mask = matching[0].mask
+        mask = match[0].mask
         if mask <= 0 or mask & (mask - 1):
             raise place.fail(
                 f"chirp {k} switches {mask.bit_count()} transmitters on; let each chirp have one"

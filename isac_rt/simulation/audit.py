@@ -268,7 +268,7 @@ def _tracing_item(setup: Setup, frames: Sequence[int]) -> Item:
         return Item("propagation", "closed forms", "the city")
     where = f"every {spacing:g} m of flight" if spacing else "each frame"
     rays = setup.scenario.propagation.rays
-    modelled = f"{rays} rays for walls from {where}; images of each frame"
+    modelled = f"{rays:,} rays for walls from {where}; images of each frame"
     missed = missed_per_frame(setup, frames)
     left = f"paths over {MATTERS_DB:g} dB over walls that no ray met"
     return Item("tracing", modelled, left, missed, "paths/frame")
@@ -280,18 +280,19 @@ def _scene_items(setup: Setup) -> list[Item]:
     faces, dropped = record["city_faces"], record["city_faces_beyond_reach"]
     if faces + dropped:
         whole = setup.plan.preset == "everything" or setup.scenario.access.establish
-        why = f"{dropped} faces out of reach, {setup.plan.reach:.0f} m by the IF filter"
-        out.append(Item("mesh", f"{faces} faces", "nothing" if whole else why))
+        why = f"{dropped:,} faces out of reach, {setup.plan.reach:,.0f} m by the IF filter"
+        out.append(Item("mesh", f"{faces:,} faces", "nothing" if whole else why))
     if (count := record["scatterers"]) is not None:
         unseen = record["scatterer_cells"] - count
-        density = f"{record['cell_area_per_metre_m']:.3g} m2 and metre from the flights"
-        modelled, why = f"{count} scatterers, one for {density}", "cells that no transmitter sees"
+        density = f"{record['cell_area_per_metre_m']:.3g} m2 per metre from the flights"
+        modelled = f"{count:,} scatterers, one to {density}"
+        why = f"{unseen:,} cells that no transmitter sees"
         error, again = record["clutter_error_db"], record["overlap_m2"]
         why += f"; overlapping surfaces of {again:.0f} m2" if again else ""
-        out.append(Item("clutter field", modelled, f"{unseen} {why}", error, "dB of a cell's mean"))
+        out.append(Item("clutter field", modelled, why, error, "dB of a cell's mean"))
         for link, left in record["merged"].items():
-            below_noise = f"{count - left} merged below the noise or occluded"
-            merged, unit = f"{left} scatterers", "dB of noise and clutter"
+            below_noise = f"{count - left:,} merged below the noise or occluded"
+            merged, unit = f"{left:,} scatterers", "dB of noise and clutter"
             out.append(Item("clutter of the link", merged, below_noise, error, unit, link))
         out.append(_mirrors_item(record["mirrors"]))
     return out
@@ -341,7 +342,7 @@ def _link_items(setup: Setup, link: Link, uses: list[Use]) -> list[Item]:
         Item("paths", modelled, dropped, left, "dB", name),
         Item(
             "wavefronts",
-            f"{num_kept - plane:,.0f} spherical",
+            f"{abs(num_kept - plane):,.0f} spherical",
             f"curvature of {plane:,.0f}",
             phase(use.plane_error for use in uses),
             "rad",
@@ -349,7 +350,7 @@ def _link_items(setup: Setup, link: Link, uses: list[Use]) -> list[Item]:
         ),
         Item(
             "flight in a frame",
-            f"{num_kept - straight:,.0f} accelerated",
+            f"{abs(num_kept - straight):,.0f} accelerated",
             f"acceleration of {straight:,.0f}",
             phase(use.straight_error for use in uses),
             "rad",

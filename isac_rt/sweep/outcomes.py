@@ -41,7 +41,7 @@ MOST_BYTES = 64 * 1024**2
 """No outcome is larger: that of a point with ten links has some 30 kB."""
 
 
-Count = Annotated[int, Field(ge=0, lt=2**53)]
+Count = Annotated[int, Field(ge=0, lt=2**53, strict=True)]
 
 
 class _Link(BaseModel):
