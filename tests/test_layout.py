@@ -245,7 +245,7 @@ MAX_LINES = {
     "track": 1946,
     "scenario": 2134,
     "results": 3704,
-    "simulation": 3691,
+    "simulation": 3692,
     "sweep": 2785,
     "views": 3582,
     "cli": 2313,
