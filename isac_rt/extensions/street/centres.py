@@ -41,8 +41,6 @@ from isac_rt.world.swarm import Pose, Swarm, turned
 GRAVITY = np.array([0.0, 0.0, 9.81])  # what a hovering UAV's thrust bears [m/s^2]
 LEAST_THRUST = 0.1
 """Acceleration of thrust [m/s^2] below which the body's Z axis is left upright: it falls freely."""
-
-
 PHASE_ERROR = 1e-3
 """Largest phase error [rad] at the ends of a piece; 0.06 % of its samples on average."""
 
@@ -107,10 +105,7 @@ class MovingCentres:
             least = 0.0 if model.replaces_echo else least_power
             bases = [base for base in bases if base.power > least]
             if bases:
-                places = model.motion(np.array([paths.epoch])).place
-                reach = float(np.linalg.norm(places, axis=-1).max())
-                speed = model.speed + reach * float(np.linalg.norm(attitude.rate))
-                slots = self._slots_of_piece(paths, name, (speed, model.jerk), poses)
+                slots = self._slots_of_piece(paths, poses, (name, model, attitude))
                 begin, time = self.pieces(slots, middle - paths.epoch)
                 offset = attitude.turned(model.motion(paths.epoch + time), time)
                 parts += [_copies(base, offset, begin, time) for base in bases]
@@ -182,25 +177,30 @@ class MovingCentres:
     def _slots_of_piece(
         self,
         paths: PathSet,
-        name: str,
-        limits: tuple[float, float],
         poses: Mapping[str, Pose],
+        of: tuple[str, CentreModel, Attitude],
     ) -> int:
         """Return the number of slots over which delays of the second order and constant directions
-        keep within `PHASE_ERROR`; `limits`: speed [m/s] and jerk [m/s^3] of the centres."""
-        speed, jerk = limits
-        w, antennas = self.waveform, self.arrays.at(paths.link)
+        keep within `PHASE_ERROR`.
+
+        The direction to a centre turns by its speed over the distance. The jerk of a centre at rho
+        that turns with the body and against the view at a rate w is 3 rho w^3 at most.
+        """
+        (name, model, attitude), w = of, self.waveform
         k = 2 * np.pi * (w.carrier_frequency + w.bandwidth) / SPEED_OF_LIGHT
-        reach = [
-            np.linalg.norm(r, axis=1).max() for r in (antennas.tx_positions, antennas.rx_positions)
-        ]
-        ends = [poses[end] for end in paths.link]
-        turning = sum(
-            r
-            * (speed + np.linalg.norm(poses[name].velocity - end.velocity))
-            / np.linalg.norm(poses[name].position - end.position)
-            for r, end in zip(reach, ends, strict=True)
-        )
+        antennas, uav = self.arrays.at(paths.link), poses[name]
+        places = model.motion(np.array([paths.epoch])).place
+        extent = float(np.linalg.norm(places, axis=-1).max())
+        spin, turning, fastest = float(np.linalg.norm(attitude.rate)), 0.0, 0.0
+        for end, elements in zip(
+            paths.link, (antennas.tx_positions, antennas.rx_positions), strict=True
+        ):
+            distance = float(np.linalg.norm(uav.position - poses[end].position))
+            passing = float(np.linalg.norm(uav.velocity - poses[end].velocity))
+            reach = float(np.linalg.norm(elements, axis=1).max())
+            turning += reach * (model.speed + spin * extent + passing) / distance
+            fastest = max(fastest, spin + passing / distance)
+        jerk = model.jerk + 3 * extent * fastest**3
         by_turning = PHASE_ERROR / max(k * turning, np.finfo(float).tiny)
         by_delay = (3 * PHASE_ERROR / max(k * jerk, np.finfo(float).tiny)) ** (1 / 3)
         return int(np.clip(2 * min(by_turning, by_delay) / w.slot_duration, 1, w.num_chirps))
