@@ -154,6 +154,7 @@ EXTENSIONS = {
     "emitters_plan": "isac_rt.extensions.street.emitters:plan_row",
     "with_foreign": "isac_rt.extensions.street.emitters:WithForeign",
     "excised": "isac_rt.extensions.street.excision:excised",
+    "boxes": "isac_rt.extensions.street.boxes:Boxes",
     "weather": "isac_rt.extensions.street.weather:Weathered",
     "weather_plan": "isac_rt.extensions.street.weather:plan_rows",
     "antenna_pattern": "isac_rt.extensions.antenna_files.patterns:antenna_pattern",

@@ -273,7 +273,7 @@ class Setup:
             arrays=arrays,
             reference=free,
             plan=plan,
-            propagation=_in_weather(
+            propagation=_extended(
                 self.scenario,
                 _maker(self.scenario, plan, free, self.city, floor)(),
                 free,
@@ -634,7 +634,7 @@ def _prepared(
         swarm,
         city,
         believed,
-        _in_weather(scenario, propagation, free, city),
+        _extended(scenario, propagation, free, city),
         free,
         timetable,
         Connections(),
@@ -654,16 +654,18 @@ def _maker(
     return partial(make_propagation, ground)
 
 
-def _in_weather(
+def _extended(
     scenario: Scenario, model: Propagation, free: FreeSpace, city: CityMesh
 ) -> Propagation:
-    """Return a propagation model with the scenario's weather."""
-    if scenario.weather is None:
-        return model
-    waveform = waveform_of(scenario.radio, scenario.array)
+    """Return a propagation model with the scenario's boxes and weather."""
+    waveform, swarm = waveform_of(scenario.radio, scenario.array), swarm_of(scenario)
     hiding = city if scenario.propagation.model == "ray_traced" else None
-    wet: Propagation = extension("weather")(scenario.weather, model, free, waveform, hiding)
-    return wet
+    if any(uav.box for uav in swarm.uavs.values()):
+        materials = {} if scenario.city is None else scenario.city.materials
+        model = extension("boxes")(swarm, materials, model, free, waveform, hiding)
+    if scenario.weather is not None:
+        model = extension("weather")(scenario.weather, model, free, waveform, hiding)
+    return model
 
 
 def _expectation_of(
@@ -814,7 +816,7 @@ def propagation_in(city: CityMesh, scenario: Scenario, sample_spacing: float = 0
     free = FreeSpace(swarm.uavs, arrays_of(scenario, waveform), waveform.wavelength, scenario.seed)
     settings = scenario.propagation, scenario.clutter
     model = make_propagation(Ground(*settings, swarm, city, waveform, free, sample_spacing))
-    return _in_weather(scenario, model, free, city)
+    return _extended(scenario, model, free, city)
 
 
 def trace(scenario: Scenario, frame: int, *, setup: Setup | None = None) -> dict[Link, PathSet]:

@@ -321,6 +321,16 @@ class Extent(Node):
             yield Problem((("size_m",), ("kind",)), text)
 
 
+class Box(Node):
+    """Closed box about a UAV's position that shadows and mirrors, such as a car or a tram."""
+
+    size_m: tuple[Positive, Positive, Positive]
+    """Width, length and height [m], along right, ahead and up of the UAV's body."""
+    material: str = "metal"
+    """Material of all faces, by its name in the table of materials or in `city.materials`. By
+    default metal, as of a car."""
+
+
 class Waypoint(Node):
     """Where a UAV is at one time."""
 
@@ -399,6 +409,9 @@ class Uav(Node):
     """Rotors whose blades modulate the UAV's echo. null, the default: none."""
     extent: Extent | None = None
     """Several scattering centres in place of one. null, the default: a point target."""
+    box: Box | None = None
+    """Box that shadows other paths and mirrors them with its faces; for targets, in place of the
+    disc of `body_radius_m`. null, the default: none."""
     clock_offset_s: Finite = 0.0
     """How late the UAV's clock is at time 0 [s]: what it sends arrives later by this, what it
     receives seems to arrive earlier. By default all clocks agree."""
@@ -450,6 +463,11 @@ class Uav(Node):
         if any(turned) and self.boresight != "velocity":
             text = "the waypoints' attitude_deg says where the UAV looks; leave one of the two out"
             yield Problem((("boresight",), ("waypoints",)), text)
+        if self.box is not None and self.role != "target":
+            text = (
+                "is for targets: a terminal would sit within it; give it to a target, or remove it"
+            )
+            yield Problem((("box",), ("role",)), text)
         for key in ("rotors", "extent"):
             if getattr(self, key) is not None and self.rcs.model == "relative":
                 text = "needs a cross-section in square metres; give the UAV another rcs.model"

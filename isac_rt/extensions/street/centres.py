@@ -207,10 +207,7 @@ class MovingCentres:
 
     def _attitude(self, name: str, epoch: float) -> Attitude:
         """Return a UAV's attitude about the epoch, to the second order in a frame."""
-        half = self.waveform.frame_duration / 2
-        before, now, after = (body_axes(self.swarm, name, epoch + t) for t in (-half, 0.0, half))
-        ahead, behind = (Rotation.from_matrix(a @ now.T).as_rotvec() for a in (after, before))
-        return Attitude(now, (ahead - behind) / (2 * half), (ahead + behind) / half**2)
+        return attitude_about(self.swarm, name, epoch, self.waveform.frame_duration / 2)
 
 
 class Attitude(NamedTuple):
@@ -234,6 +231,13 @@ class Attitude(NamedTuple):
         return Motion(*(m @ axes.swapaxes(1, 2) for m in (own.place, velocity, acceleration)))
 
 
+def attitude_about(swarm: Swarm, name: str, epoch: float, half: float) -> Attitude:
+    """Return a UAV's attitude about an epoch, to the second order within `half` [s] of it."""
+    before, now, after = (body_axes(swarm, name, epoch + t) for t in (-half, 0.0, half))
+    ahead, behind = (Rotation.from_matrix(a @ now.T).as_rotvec() for a in (after, before))
+    return Attitude(now, (ahead - behind) / (2 * half), (ahead + behind) / half**2)
+
+
 def body_axes(swarm: Swarm, name: str, time: float) -> np.ndarray:
     """Return the axes of a UAV's body at a time [s], (3, 3) columns right, ahead and up.
 
@@ -246,6 +250,7 @@ def body_axes(swarm: Swarm, name: str, time: float) -> np.ndarray:
     if uav.waypoints is not None and uav.waypoints[0].attitude_deg is not None:
         return own
     stands = uav.extent is not None and uav.extent.kind in ("vehicle", "agv", "pedestrian")
+    stands = stands or uav.box is not None
     up = GRAVITY if stands else pose.acceleration + GRAVITY
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > LEAST_THRUST else GRAVITY / GRAVITY[2]
     right = np.cross(own[:, 1], up)

@@ -21,7 +21,6 @@ half a wavelength over that speed, 2 ms at 77 GHz, less than a frame.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -33,6 +32,7 @@ from isac_rt.extensions.street.air import (
     vapour_pressure,
 )
 from isac_rt.extensions.street.drops import DIAMETERS_MM, Drops, fall_speed
+from isac_rt.extensions.street.occlusion import Occlusion
 from isac_rt.frame.level import LinkBudget
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
@@ -104,7 +104,8 @@ class Weathered:
         city: CityMesh | None,
     ) -> None:
         self.model, self._settings = model, settings
-        self._free, self._waveform, self._city = free, waveform, city
+        self._free, self._waveform = free, waveform
+        self._occlusion = Occlusion(city, waveform.carrier_frequency)
         frequency = waveform.effective_carrier
         self.air = Air(settings, frequency)
         self.drops = Drops(settings.rain_mm_per_h, frequency, settings.temperature_c + ZERO_CELSIUS)
@@ -137,7 +138,7 @@ class Weathered:
         section = expected * self.drops.cross_sections(classes, there.departure, back.arrival)
         amplitude = np.sqrt(self._free.wavelength**2 / (4 * np.pi) ** 3 * weight * section)
         amplitude *= state.elements(self._free.arrays, ways)
-        amplitude[self._hidden(state, points)] = 0.0
+        amplitude[self._occlusion.hidden(state, points)] = 0.0
         white = rng.standard_normal((len(points), 2)) @ np.array([1, 1j]) / np.sqrt(2)
         return state.paths(ways, amplitude * white, PathKind.DIFFUSE)
 
@@ -172,24 +173,6 @@ class Weathered:
         share = share / share.sum()
         classes = rng.choice(share.size, count, p=share)
         return classes, self.drops.density[classes] / share[classes]
-
-    @cached_property
-    def _line_of_sight(self) -> Any:
-        from isac_rt.propagation.segments.rays import LosTest  # after the back end's start
-        from isac_rt.world.city.scene import shared_scenes
-
-        assert self._city is not None
-        return LosTest(shared_scenes(self._city, self._waveform.carrier_frequency).faces)
-
-    def _hidden(self, state: LinkState, points: np.ndarray) -> np.ndarray:
-        """Mark the points (K,) that a surface hides from either end."""
-        hidden = np.zeros(len(points), bool)
-        if self._city is None or not self._city.num_faces:
-            return hidden
-        for end in (state.start, state.end):
-            start = np.broadcast_to(end.position, points.shape) - self._city.origin
-            hidden |= ~self._line_of_sight.clear(start, points - self._city.origin)
-        return hidden
 
 
 def _axes(span: np.ndarray) -> np.ndarray:

@@ -32,7 +32,11 @@ class UavDiscs:
     @classmethod
     def of(cls, uavs: Mapping[str, Uav], poses: dict[str, Pose]) -> UavDiscs:
         """UAVs of a scenario's UAVs where they are."""
-        names = tuple(name for name, uav in uavs.items() if uav.body_radius_m > 0 and name in poses)
+        names = tuple(
+            name
+            for name, uav in uavs.items()
+            if uav.body_radius_m > 0 and uav.box is None and name in poses
+        )
         positions = np.array([poses[name].position for name in names]).reshape(-1, 3)
         return cls(names, positions, np.array([uavs[name].body_radius_m for name in names]))
 
