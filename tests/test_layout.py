@@ -243,7 +243,7 @@ MAX_LINES = {
     "signal": 837,
     "receive": 6075,
     "track": 1946,
-    "scenario": 2134,
+    "scenario": 2139,
     "results": 3704,
     "simulation": 3694,
     "sweep": 2785,

@@ -719,10 +719,15 @@ class Scenario(Node):
             yield Problem((("weather",), ("radio", "carrier_hz")), message)
 
     def _emitter_problems(self) -> Iterator[Problem]:
-        for name in self.emitters:
+        for name, emitter in self.emitters.items():
             if name in self.swarm:
                 said = "is the name of a UAV of the swarm; choose another"
                 yield Problem((("emitters", name), ("swarm", name)), said)
+            place = emitter.uav().position_at(0.0)
+            for other, uav in self.swarm.items():
+                if math.dist(place, uav.position_at(0.0)) < NEAREST_M:
+                    said = f"is less than {NEAREST_M} m from {other} at the start; move one of them"
+                    yield Problem((("emitters", name), ("swarm", other)), said)
         if self.emitters and self.noise.model == "snr":
             said = "send a power in dBm, which noise.model snr does not know; take link_budget"
             yield Problem((("emitters",), ("noise", "model")), said)

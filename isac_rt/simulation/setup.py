@@ -641,7 +641,7 @@ def _prepared(
         plan,
         _expectation_of(scenario, plan, free, believed),
     )
-    _ = setup.calibration  # refuses a wrong file here
+    _ = setup.calibration, setup.emitters  # what cannot be is refused here
     return _connected(setup)
 
 

@@ -31,6 +31,7 @@ import numpy as np
 from scipy.fft import next_fast_len
 from scipy.special import fresnel
 
+from isac_rt.document import ScenarioError
 from isac_rt.extensions.street.weather import Air
 from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.frame.link import Link
@@ -46,6 +47,7 @@ from isac_rt.signal.noise import SILENCE, WhiteNoise
 from isac_rt.signal.tones import Tones, element_delay
 from isac_rt.simulation.setup import propagation_in
 from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.passage import enclosed, obstacles
 from isac_rt.world.swarm import Pose, Trajectory
 
 MARGIN = 4.0
@@ -139,6 +141,13 @@ class Emitters:
         self._trains = {
             name: Train.of(e, name, scenario.seed) for name, e in scenario.emitters.items()
         }
+        for name, flight in self._flights.items():
+            place = flight.pose(0.0).position - city.origin
+            if enclosed(city, place) and enclosed(obstacles(city, place[None]), place):
+                raise ScenarioError(
+                    f"emitters.{name}: starts inside a building of {city.name} or under its "
+                    "ground; change its position_m or waypoints"
+                )
 
     @cached_property
     def _model(self) -> Any:

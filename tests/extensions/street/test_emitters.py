@@ -209,10 +209,13 @@ def test_radars_of_two_chirps_disturb_each_other():
         (["emitters.car.boresight=[0,0,0]"], "points nowhere"),
         (["emitters.gate.start_hz=77"], "ends below 0 Hz"),
         (["emitters.car.velocity_mps=[0,20000,0]"], "faster than"),
+        (["emitters.car.position_m=[15,0,5]", *OPEN], "emitters.car: starts inside a building"),
+        (["emitters.car.position_m=[3,20,-1]", *OPEN], "emitters.car: .*under its ground"),
+        (["emitters.car.position_m=[-3.1,-20.3,9.2]"], "emitters.car: .*0.05 m from AT"),
         (["noise.model=snr"], "emitters: .*noise.model snr does not know"),
         (["emitters.AT={position_m: [0,0,1], boresight: [0,1,0], start_hz: 77e9}"], "emitters.AT"),
     ],
 )
 def test_emitters_that_cannot_be_are_refused(more, said):
     with pytest.raises(ScenarioError, match=said):
-        load(SCENE, more)
+        prepare(load(SCENE, more))
