@@ -244,7 +244,7 @@ MAX_LINES = {
     "receive": 6075,
     "track": 1946,
     "scenario": 2139,
-    "results": 3704,
+    "results": 3705,
     "simulation": 3694,
     "sweep": 2785,
     "views": 3582,

@@ -99,8 +99,9 @@ def path_content(tree: Mapping[str, Any], city: str) -> str:
 
 
 def _without_front_end(node: Mapping[str, Any]) -> dict[str, Any]:
-    """The hardware and its calibration show in the samples, not in the paths."""
-    return {key: value for key, value in node.items() if key not in ("front_end", "calibration")}
+    """Leave out hardware, calibration and rotors, which show in the samples, not in the paths."""
+    unseen = ("front_end", "calibration", "rotors")
+    return {key: value for key, value in node.items() if key not in unseen}
 
 
 def run_content(scenario: Scenario, snapshots: int, city: str | None = None) -> str:

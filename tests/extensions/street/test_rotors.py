@@ -15,6 +15,7 @@ from isac_rt.frame.antennas import Antennas, Arrays
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.pathset import PathKind, make_paths
+from isac_rt.results.provenance import path_content
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.exact import filter_gain
 from isac_rt.world.settings import Rotors, Uav
@@ -421,6 +422,12 @@ def test_paths_of_a_frame_are_the_bodys_own():
     plain, rotors = (irt.prepare(scenario(rotors=r)).frame(0) for r in (None, {}))
     for name, column in plain.paths[OWN].arrays().items():
         assert np.array_equal(column, rotors.paths[OWN].arrays()[name], equal_nan=True)
+
+
+def test_traced_paths_are_kept_whatever_the_rotors():
+    """A sweep of rotors traces once. Planted bug: `rotors` among what paths depend on."""
+    trees = (scenario(rotors=r).model_dump(mode="json") for r in (None, {}, {"rev_per_min": 3000}))
+    assert len({path_content(tree, "") for tree in trees}) == 1
 
 
 @pytest.mark.parametrize(
