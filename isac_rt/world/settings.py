@@ -392,9 +392,9 @@ class Uav(Node):
     """Two places or more with their times, which the UAV flies through on a smooth curve; in place
     of `position_m` and `velocity_mps`."""
     flight: str | None = None
-    """File instead of `waypoints`: CSV with time_s, x, y, z [m], or time_s, lat, lon, alt, and
-    optionally yaw_deg, pitch_deg, roll_deg; or a log of PX4, ROS 2 or SUMO as FILE#PART@START. A
-    final ~SECONDS smooths it. The path is relative to the scenario's folder."""
+    """File instead of `waypoints`, relative to the scenario's folder: CSV of time_s and x, y, z [m]
+    or lat, lon, alt, optionally yaw_deg, pitch_deg, roll_deg; or a log of PX4, ROS 2 or SUMO as
+    FILE#PART@START. A final ~SECONDS smooths it."""
     mount_deg: Vector = (0.0, 0.0, 0.0)
     """How the arrays are turned against the UAV's own frame: yaw to the right, pitch up, roll
     [degrees], as of a radar that looks sideways from a car. By default they look ahead."""
