@@ -393,7 +393,7 @@ class Uav(Node):
     of `position_m` and `velocity_mps`."""
     flight: str | None = None
     """File instead of `waypoints`, relative to the scenario's folder: CSV of time_s and x, y, z [m]
-    or lat, lon, alt, optionally yaw_deg, pitch_deg, roll_deg; or a log of PX4, ROS 2 or SUMO as
+    or lat, lon, alt, optionally yaw_deg, pitch_deg, roll_deg; or a log (PX4, ROS 2, SUMO) as
     FILE#PART@START. A final ~SECONDS smooths it."""
     mount_deg: Vector = (0.0, 0.0, 0.0)
     """How the arrays are turned against the UAV's own frame: yaw to the right, pitch up, roll
