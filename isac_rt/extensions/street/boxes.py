@@ -121,10 +121,8 @@ class Boxes:
         for link, paths in found.items():
             state = LinkState(link, epoch, poses[link.tx], poses[link.rx], paths.target_names)
             parts = [self._mirrored(state, box) for box in boxes]
-            owner = np.append(
-                [paths.target_names[k] if k >= 0 else "" for k in paths.target],
-                np.repeat([box.name for box in boxes], list(map(len, parts))),
-            )
+            mirrors = np.repeat([box.name for box in boxes], list(map(len, parts)))
+            owner = np.append(np.array([*paths.target_names, ""])[paths.target], mirrors)
             every = merge([paths, *itertools.chain(*parts)])
             factor = self._shadow(every, state, boxes, owner)
             out[link] = replace(every, gain=every.gain * factor)
@@ -266,9 +264,8 @@ def past_box(
     largest_unit = np.sqrt(wavelength * total / 8)
     near = np.flatnonzero(off < np.linalg.norm(box.half) + LIT_REACH * largest_unit)
     corners = centre + (CORNERS * box.half) @ box.attitude.axes.T
-    # across and level, along, and across both
-    level = level_across(along[near])
-    basis = np.stack([level, along[near], np.cross(level, along[near])], axis=2)
+    up = vertical(along[near])
+    basis = np.stack([np.cross(along[near], up), along[near], up], axis=2)  # level, along, across
     low, high = extent_between((corners - starts[near, None]) @ basis, length[near])
     there = np.isfinite(low[:, 1])
     near, low, high = near[there], low[there], high[there]
@@ -279,14 +276,6 @@ def past_box(
     screened = (knife_edge(first) - knife_edge(last)).prod(axis=1)
     out[near] = tapered(1 - screened, np.maximum(first, -last).max(axis=1))
     return out
-
-
-def level_across(along: np.ndarray) -> np.ndarray:
-    """Return level unit vectors (K, 3) across unit vectors (K, 3)."""
-    size = np.hypot(along[:, 0], along[:, 1])
-    upright = size < np.finfo(float).eps
-    across = np.stack([along[:, 1], -along[:, 0], 0 * size], axis=1)
-    return np.where(upright[:, None], [1.0, 0.0, 0.0], across / np.where(upright, 1, size)[:, None])
 
 
 def extent_between(corners: np.ndarray, length: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
