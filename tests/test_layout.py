@@ -249,7 +249,7 @@ MAX_LINES = {
     "sweep": 2785,
     "views": 3582,
     "cli": 2313,
-    "extensions": 14836,
+    "extensions": 14825,
 }
 """Lines of each room, which only go down."""
 

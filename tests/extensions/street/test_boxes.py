@@ -221,6 +221,20 @@ def test_a_tram_beside_a_terminal_hides_nothing_across_the_street():
     assert line == pytest.approx(WAVELENGTH / (4 * np.pi * np.hypot(20, 20)), rel=0.02)
 
 
+def test_a_box_hides_others_and_not_its_own_echo():
+    """Planted bug: `owner` of nobody."""
+    uavs = {
+        "AT": Uav(role="active", position_m=(0, 0, 1)),
+        "behind": Uav(role="target", position_m=(1, 30, 1)),
+        "box": box_of((2.0, 4.0, 3.0), position_m=(0.2, 15, 1), boresight=(0, 1, 0)),
+    }
+    free, swarm = FreeSpace(uavs, POINT, WAVELENGTH, 3), Swarm(uavs, 1.0)
+    model = Boxes(swarm, {}, free, free, WAVEFORM, None)
+    ours, alone = (m.trace(swarm.poses(0.0), 0.0, [OWN]).paths[OWN].gain[:2] for m in (model, free))
+    loss = np.abs(ours / alone)
+    assert loss[1] == 1.0 and loss[0] < 0.05
+
+
 def test_bad_boxes_are_refused_with_their_key():
     with pytest.raises(UserError, match=r"swarm.box.box.material: .*marzipan.*known are"):
         stage(box_of(material="marzipan", position_m=(0, 0, 0)))
