@@ -39,11 +39,11 @@ class Emitter(Node):
     array: Array = Array()
     """Pattern of its antenna: `element_pattern`, `element_gain_dbi` and `field_of_view_deg` of one
     element. By default a patch antenna."""
-    start_hz: Positive
+    start_hz: Annotated[float, Field(ge=1e9, le=1e12, allow_inf_nan=False)]
     """Frequency at which its chirps start [Hz]."""
-    slope_mhz_per_us: Finite
+    slope_mhz_per_us: Annotated[float, Field(ge=-1e4, le=1e4, allow_inf_nan=False)]
     """Slope of its chirps [MHz/us], negative for falling ones."""
-    ramp_us: Positive
+    ramp_us: Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
     """Duration of the ramp of a chirp [us]."""
     idle_us: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     """Pause between a ramp's end and the next one's start [us]."""

@@ -550,6 +550,7 @@ class Scenario(Node):
             alone._self_calibration_problems,
             alone._calibration_problems,
             alone._front_end_problems,
+            alone._weather_problems,
         ]
         if alone.radio.scheme != self.radio.scheme:
             rules.append(alone._fmcw_receiver_problems)

@@ -532,10 +532,12 @@ def _flight_error(setup: Setup, frame: int, paths: PathSet) -> float:
 
 
 def _with_chains(paths: PathSet) -> PathSet:
-    """Select the paths whose delays `delays` can evaluate. Two-bounce clutter moves like a farther
-    scatterer and is left out: one bounce is the worse case."""
+    """Select the paths whose delays `delays` can evaluate, which are none over mirrors that move.
+    Two-bounce clutter moves like a farther scatterer and is left out: one bounce is the worse
+    case."""
     one_bounce = (paths.faces >= 0).any(axis=1) & (paths.bounces == 1)
     there = (paths.kind != PathKind.DIFFUSE) | one_bounce
+    there &= (paths.kind != PathKind.SPECULAR) | (paths.faces >= 0).any(axis=1)
     return paths.select(~paths.bent & (paths.kind != PathKind.LEAKAGE) & there)
 
 

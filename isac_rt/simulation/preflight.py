@@ -103,12 +103,13 @@ def check_flights(swarm: Swarm, timetable: Timetable) -> None:
             )
     for (a, first), (b, second) in itertools.combinations(polylines.items(), 2):
         distance = np.linalg.norm(first - second, axis=1)
-        nearest = int(np.argmin(distance))
-        if distance[nearest] < NEAREST_M:
+        nearest, boxes = int(np.argmin(distance)), (swarm.uavs[a].box, swarm.uavs[b].box)
+        least = max([NEAREST_M, *(min(box.size_m) / 2 for box in boxes if box is not None)])
+        if distance[nearest] < least:
             raise ScenarioError(
                 f"swarm.{b}: is {distance[nearest]:.2g} m from {a} at {epochs[nearest]:.4g} s "
                 f"(frame {nearest * step}), at least "
-                f"{NEAREST_M} m are needed; change one of their flights"
+                f"{least:g} m are needed; change one of their flights"
             )
 
 

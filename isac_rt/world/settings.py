@@ -252,12 +252,16 @@ class Rcs(Node):
             yield Problem((("table",), ("model",)), text)
 
 
+MOST_BLADES_M = 8.0
+"""Length of all blades of a UAV together [m]; 1 m is 1,000 points in each slot, 0.2 GB a frame."""
+
+
 class Rotors(Node):
     """Rotors of a UAV, whose blades turn in the plane across its body's Z axis."""
 
     number: Annotated[int, Field(ge=1, le=16)] = 4
-    """Number of rotors, evenly spaced about the body, the first halfway between ahead and right;
-    neighbours turn in opposite directions. By default four, a quadcopter."""
+    """Number of rotors, evenly spaced about the body, the first of four halfway between ahead and
+    right; one stands in the middle. Every second one turns the other way. By default four."""
     arm_m: Annotated[float, Field(ge=0, le=10)] = 0.2
     """Distance of each rotor's hub from the middle of the body [m]. The default is that of a
     quadcopter of 1 kg."""
@@ -279,6 +283,12 @@ class Rotors(Node):
         return 2 * math.pi * self.rev_per_min / 60 * self.blade_length_m
 
     def problems(self) -> Iterator[Problem]:
+        if (total := self.number * self.blades * self.blade_length_m) > MOST_BLADES_M:
+            yield Problem(
+                (("number",), ("blades",), ("blade_length_m",)),
+                f"blades of {total:g} m together, at most {MOST_BLADES_M:g} m fit the memory; "
+                "take fewer or shorter ones",
+            )
         if self.tip_speed > SOUND_MPS:
             yield Problem(
                 (("rev_per_min",), ("blade_length_m",)),

@@ -197,7 +197,9 @@ def test_keys_hold_every_value_of_a_scenario(folder):
     assert len(places) > 150
     point, paths, content = set(), set(), set()
     unseen = [
-        at for at in places if at[0] in UNSEEN_BY_PATHS or {"front_end", "calibration"} & set(at)
+        at
+        for at in places
+        if at[0] in UNSEEN_BY_PATHS or {"front_end", "calibration", "rotors"} & set(at)
     ]
     for at in places:
         one = changed(tree, at)

@@ -160,7 +160,7 @@ def test_the_plan_counts_what_the_summary_counts():
     lines = {item["what"]: item for item in planned["items"]}
     assert str(record["city_faces"]) in lines["mesh"]["modelled"]
     assert str(record["city_faces_beyond_reach"]) in lines["mesh"]["left_out"]
-    assert str(record["scatterers"]) in lines["clutter field"]["modelled"]
+    assert f"{record['scatterers']:,}" in lines["clutter field"]["modelled"]
     assert lines["clutter field"]["estimate"] == record["clutter_error_db"]
     assert planned["clutter_bounces"] == 1 and record["mirrors"] is None
     assert "clutter.mirrors" in lines["clutter by mirrors"]["left_out"]

@@ -143,7 +143,8 @@ class MovingCentres:
         over_noise : by link, the mean power of a cell over the noise for a mean |gain|^2 of one
         """
         w, out = self.waveform, []
-        widest, slot = 1 / (2 * w.slot_duration), w.chirp_duration - w.window_start
+        widest = 1 / (2 * w.slot_duration)
+        slot = w.chirp_duration + (w.num_groups - 1) * w.group_spacing - w.window_start
         for name, model in self.models:
             edge, level = 2 * model.speed / w.wavelength, -np.inf
             for link, paths in found.items():
@@ -157,8 +158,8 @@ class MovingCentres:
                     "what": f"moving parts of {name}",
                     "modelled": f"{model.described()}, {level:.0f} dB over the noise of a cell; "
                     f"Doppler to {edge:.4g} Hz either side, slots show {widest:.4g} Hz",
-                    "left_out": "jerk within chirps",
-                    "estimate": error * 2 * (slot / 2) ** 3 / (6 * SPEED_OF_LIGHT),
+                    "left_out": "jerk and turning within pieces of the frame",
+                    "estimate": max(PHASE_ERROR, error * slot**3 / (24 * SPEED_OF_LIGHT)),
                     "unit": "rad",
                 }
             )

@@ -102,7 +102,8 @@ class Train:
         if self.burst is None:
             first, last = (np.ceil((t - self.offset) / self.repetition) for t in (begin, end))
             return np.arange(first, last) * self.repetition + self.offset
-        bursts = np.arange(np.floor(begin / self.interval) - 1, np.ceil(end / self.interval) + 1)
+        first, last = ((t - self.offset) / self.interval for t in (begin, end))
+        bursts = np.arange(np.floor(first) - 1, np.ceil(last) + 1)
         within = np.arange(self.burst) * self.repetition + self.offset
         starts = (bursts[:, None] * self.interval + within).ravel()
         return starts[(starts >= begin) & (starts < end)]

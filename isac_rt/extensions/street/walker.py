@@ -1,6 +1,6 @@
 r"""Scattering centres of a pedestrian: a trunk, and limbs that swing as pendulums.
 
-A cycle of two steps lasts :math:`T = 1.346\,H/\sqrt{v H}` at speed v with thighs of length H
+A cycle of two steps lasts :math:`T = 1.346\sqrt{H/v}` at speed v with the hips at height H
 (R. Boulic, N. Magnenat-Thalmann, D. Thalmann, A global human walking model with real-time kinematic
 personification, 1990: relative length of a cycle 1.346 times the root of relative speed). Legs
 swing by :math:`\arcsin(vT/(4L))` about the hips, which spans a step; arms by as much about the
@@ -21,9 +21,9 @@ from isac_rt.world.settings import Extent
 from isac_rt.world.swarm import Swarm
 
 CYCLE = 1.346
-THIGH, LEG, SHOULDER, ARM = 0.245, 0.53, 0.82, 0.44
-"""Lengths of thigh and leg, height of the shoulders and length of an arm over the body's height
-(Drillis and Contini, Body Segment Parameters, 1966)."""
+LEG, SHOULDER, ARM = 0.53, 0.82, 0.44
+"""Length of a leg, which is the height of the hips, height of the shoulders and length of an arm
+over the body's height (Drillis and Contini, Body Segment Parameters, 1966)."""
 HIP_X, SHOULDER_X = 0.055, 0.13
 """Sideways distance of hip and shoulder from the middle over the body's height."""
 POINTS = {"trunk": 48, "leg": 24, "arm": 16}
@@ -94,21 +94,22 @@ HUMAN_DBSM, HEIGHT_M = -1.37, 1.75
 
 
 def walker_of_flight(extent: Extent, swarm: Swarm, seed: int, name: str) -> Walker:
-    """Return the centres of a pedestrian who walks at the mean speed of the flight, with a phase
-    drawn by name."""
-    flight = swarm.trajectories[name]
-    times = np.linspace(0.0, max(swarm.duration, 1.0), PLACES)
+    """Return the centres of a pedestrian who walks at the mean speed between the waypoints, with
+    a phase drawn by name."""
+    flight, way_points = swarm.trajectories[name], swarm.uavs[name].waypoints
+    span = (0.0, 1.0) if way_points is None else (way_points[0].time_s, way_points[-1].time_s)
+    times = np.linspace(*span, PLACES)
     way = np.linalg.norm(np.diff(flight.positions(times), axis=0), axis=1).sum()
     height = HEIGHT_M if extent.size_m is None else extent.size_m[2]
     start = generator(seed, "walker", name).uniform(0, 2 * np.pi)
-    return walker_of(height, float(way) / times[-1], 10 ** (HUMAN_DBSM / 10), start)
+    return walker_of(height, float(way) / (span[1] - span[0]), 10 ** (HUMAN_DBSM / 10), start)
 
 
 def walker_of(height: float, speed: float, section: float, start: float) -> Walker:
     """Return the centres of a pedestrian of a height [m] and a speed [m/s], whose position is the
     height of the hips; `section` [m^2], and `start`: phase of the right leg at time 0 [rad]."""
-    thigh, leg = THIGH * height, LEG * height
-    rate = 2 * np.pi * np.sqrt(speed * thigh) / (CYCLE * thigh)
+    leg = LEG * height
+    rate = 2 * np.pi / CYCLE * np.sqrt(speed / leg)
     step = speed * 2 * np.pi / rate / (4 * leg) if rate else 0.0
     swing = min(np.arcsin(min(step, 1.0)), LARGEST_SWING)
     trunk = np.linspace(0, (1 - LEG) * height, POINTS["trunk"])

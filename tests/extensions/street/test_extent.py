@@ -123,13 +123,12 @@ def test_what_stands_on_the_ground_stays_upright():
 
 
 def test_a_pedestrian_walks_at_the_speed_of_the_flight():
-    """Planted bug: `PLACES` for `times[-1]`."""
+    """Planted bugs: `PLACES` for the time between waypoints; the thigh for the leg."""
     uav = Uav(role="target", position_m=(0, 0, 1), velocity_mps=(0, 1.4, 0))
     walker = walker_of_flight(Extent(kind="pedestrian"), Swarm({"P": uav}), 1, "P")
     assert walker.length.size == 128
-    assert 2 * np.pi / walker.rate == pytest.approx(
-        1.346 * 0.245 * 1.75 / np.sqrt(1.4 * 0.245 * 1.75)
-    )
+    assert 2 * np.pi / walker.rate == pytest.approx(1.346 * np.sqrt(0.53 * 1.75 / 1.4))
+    assert 100 < 120 * walker.rate / (2 * np.pi) < 120  # steps a minute, as adults walk
 
 
 @pytest.mark.parametrize(
