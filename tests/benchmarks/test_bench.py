@@ -150,6 +150,7 @@ def test_whole_commands_say_which_one_is_at_work(monkeypatch, caplog):
     ]
 
 
+@pytest.mark.slow
 def test_the_peak_of_memory_is_of_the_process_alone():
     """A process that takes 400 MB starts another, which says what it has had: some 50 MB, and what
     it then takes. The children of a benchmark said 1,248 MB each, that of the benchmark itself.

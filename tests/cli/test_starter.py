@@ -100,6 +100,7 @@ def test_no_picture_is_written_over(tmp_path, capsys):
     assert (tmp_path / "holiday.png").read_bytes() == b"mine"
 
 
+@pytest.mark.slow
 def test_a_path_may_have_any_letters(tmp_path):
     """Planted bug: the path written as JSON, whose pairs of surrogates YAML does not join."""
     folder = tmp_path / 'ü\U0001f600 #: "q'

@@ -193,6 +193,7 @@ def test_cells_do_not_know_the_order_of_faces(seed):
     assert digest(all_cells(permuted(city, seed))) == digest(all_cells(city))
 
 
+@pytest.mark.slow
 def test_cells_are_the_same_in_every_process():
     """Planted bug: Python's own hash(), which is salted, in the seed."""
     program = (

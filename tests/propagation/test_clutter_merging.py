@@ -112,6 +112,7 @@ def test_merging_keeps_area_and_sum_and_places():
     assert all(tuple(p) in places for p in left.points)
 
 
+@pytest.mark.slow
 def test_merged_amplitudes_are_gaussian_and_places_are_drawn_by_area():
     """Over 900 seeds: mean power one and the Rayleigh law (Kolmogorov-Smirnov at 1e-4), and the
     place that stands for a face against the areas of its cells (chi squared at 1e-4). Planted
@@ -309,6 +310,7 @@ def test_who_sees_all_scatterers():
     assert census.merged == {str(one): len(field.of(one).cells) for one in (own, link)}
 
 
+@pytest.mark.slow
 def test_the_budget_check_measures_what_merging_does():
     """Beside its bound, on every link; nothing where nothing is merged. Planted bug: the merged
     field against itself."""

@@ -242,6 +242,7 @@ def test_wrong_transitions_are_undone_by_the_path_itself():
     assert decide_phases(Moments(empty.samples, sent), start, 8) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [-14.0, -9.0])
 @pytest.mark.parametrize("refinement", ["local", "joint"])
 def test_velocity_errors_are_those_stated_where_decisions_err(snr_db: float, refinement: str):

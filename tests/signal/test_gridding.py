@@ -262,6 +262,7 @@ def test_error_of_the_others_beside_what_noise_covers(speed):
     assert relative(gridded(w, tones), exact(w, tones)) < GRIDDED_ERROR
 
 
+@pytest.mark.slow
 def test_covered_paths_near_each_other_and_far_apart():
     """Lines on one grid step, on neighbouring ones, some steps apart and beyond a block of them.
     Planted bugs: lines two steps apart taken for neighbours; weights of the next place in a step;

@@ -466,6 +466,7 @@ def certificate(folder, monkeypatch):
         monkeypatch.setenv(f"{tls}{role}__CERT", str(certificate))
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_killed_is_one_message(folder, certificate):
     """It dies as soon as it has points: exit 1, and after the progress nothing but what to do.
     Planted bug: Dask's own log left as it is, which shows how its reconnection failed."""

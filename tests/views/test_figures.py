@@ -292,6 +292,7 @@ def test_names_of_a_dense_swarm_cover_each_other_nowhere():
             assert {text for text, _ in drawn_texts(figure)} >= set(names)
 
 
+@pytest.mark.slow
 def test_files_figures_and_report_load_no_dask(tmp_path):
     """Arrays of arrays in blocks take longer to load than three figures to draw. Planted bugs: a
     variable made with a look at its type; names of places left to the dataset to index; an observer

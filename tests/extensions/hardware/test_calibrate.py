@@ -162,6 +162,7 @@ def test_a_scene_without_a_reflector_is_refused_with_the_reason(board):
         calibrate(replace_samples(capture, samples))
 
 
+@pytest.mark.slow
 def test_two_reflectors_side_by_side_and_half_a_spectrum_are_refused(board, tmp_path):
     """A second reflector of the same strength 1.6 cells behind the first, in another direction: the
     strongest point between them passes for one. Of a spectrum cut in half the range would be

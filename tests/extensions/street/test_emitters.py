@@ -87,6 +87,7 @@ def test_the_power_that_arrives_is_by_friis_and_both_patterns():
     assert -10 * np.log10(attenuated) == pytest.approx([0.0297 * distance], rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.sionna
 def test_the_city_reflects_foreign_chirps_once():
     """The nearest wall's image is among the paths to a terminal. Planted bug: no bounces."""

@@ -53,6 +53,7 @@ def test_a_pulse_goes_and_a_line_of_50_db_stays():
     assert np.mean(np.abs(error) ** 2) < 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.sionna
 def test_excision_gives_a_street_its_targets_back():
     """Four frames of the scene, both sets on the same samples: a car's chirps hide U1 and PT1 from

@@ -95,6 +95,7 @@ def test_drops_attenuate_as_the_recommendation_says(frequency, rain):
     assert carried.sum() * 3.6e6 == pytest.approx(rain)
 
 
+@pytest.mark.slow
 def test_power_of_rain_between_two_terminals_is_the_integral_over_the_volume():
     """A passive terminal 31 m away with fields of view: against uniform points in a box, all
     classes of drops at each. Planted bug: uniform in d for uniform in w; the wave after the drop
@@ -141,6 +142,7 @@ def test_bistatic_drops_keep_the_wave_upright():
     assert found == pytest.approx(said, abs=0.02)
 
 
+@pytest.mark.slow
 def test_spectrum_of_rain_is_that_of_falling_drops():
     """Straight above, speeds follow their backscatter: mean and spread of the closing velocity;
     level in the wind's direction, twice the wind along the path. Planted bug: drops that rise; wind
@@ -259,6 +261,7 @@ def test_without_rain_there_are_no_more_paths():
         assert (np.abs(paths.gain) < np.abs(dry.find(0)[1][link].gain)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.sionna
 def test_rain_in_a_street_brings_detections_of_no_target():
     """Four frames of the scene: AT finds U1 among five times the clutter of dry air, PT1 decodes.
