@@ -8,8 +8,8 @@ import pytest
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
 SOURCES = sorted(FOLDER.glob("*.py"))
-LONG = ("9_learned_detector", "10_learned_labels")
-"""A minute and more."""
+LONG = ("6_own_receiver", "7_sweep", "9_learned_detector", "10_learned_labels")
+"""Left to the slow tests, which run each in a kernel."""
 QUICK = [
     pytest.param(source, marks=pytest.mark.slow if source.stem in LONG else ())
     for source in SOURCES
