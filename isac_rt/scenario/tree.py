@@ -231,7 +231,7 @@ class Scenario(Node):
         if self.radio.chirp is not None:
             slope = self.radio.chirp.slope_mhz_per_us
         late = self.first_blocks()[name] * 2 * times.max_delay + uav.clock_offset_s
-        return Emitter(
+        return Emitter.model_construct(
             **{key: getattr(uav, key) for key in FLIGHT if key in uav.model_fields_set},
             power_dbm=self.noise_of(name).tx_power_dbm + 10 * math.log10(at_once),
             array=uav.array or self.array,

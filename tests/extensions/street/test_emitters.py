@@ -201,6 +201,21 @@ def test_radars_of_two_chirps_disturb_each_other():
     assert all(not part.foreign for part in elsewhere._by_chirp.values())
 
 
+def test_radars_of_chirps_shorter_than_any_that_is_stated_disturb_each_other():
+    """What a radar sends is within its own limits. Planted bug: it checked as an emitter that a
+    person states."""
+    radio = {"mode": "fmcw", "samples_per_chirp": 32, "sampling_rate_hz": 1e8}
+    radio |= {"bandwidth_hz": 3e8, "chirps_per_frame": 24}
+    swarm = {
+        name: {k: v for k, v in uav.items() if k != "radio"} for name, uav in TWO["swarm"].items()
+    }
+    swarm["B"]["radio"] = radio | {"bandwidth_hz": 4e8}
+    tree = {"frames": 1, "receiver_preset": "plain", "radio": radio, "swarm": swarm}
+    setup = prepare(load(tree | {"noise": {"model": "link_budget"}}))
+    assert setup.waveform.chirp_duration < 1e-6
+    assert all(part.foreign for part in setup.frame(0)._by_chirp.values())
+
+
 @pytest.mark.parametrize(
     ("more", "said"),
     [
@@ -209,6 +224,7 @@ def test_radars_of_two_chirps_disturb_each_other():
         (["emitters.gate.burst_chirps=null"], "goes with burst_interval_s"),
         (["emitters.car.boresight=[0,0,0]"], "points nowhere"),
         (["emitters.gate.start_hz=77"], "emitters.gate.start_hz"),
+        (["emitters.gate.slope_mhz_per_us=-9000"], "ends below 0 Hz"),
         (["emitters.car.velocity_mps=[0,20000,0]"], "faster than"),
         (["emitters.car.position_m=[15,0,5]", *OPEN], "emitters.car: starts inside a building"),
         (["emitters.car.position_m=[3,20,-1]", *OPEN], "emitters.car: .*under its ground"),
