@@ -339,8 +339,8 @@ OF_CASES = {
     ),
     "lines of a circling point": Bug(
         "extensions/street/centres.py",
-        "longer = _dot(rho, rho - 2 * q)",
-        "longer = _dot(rho, rho - 2.0001 * q)",
+        "longer = np.vecdot(rho, rho - 2 * q)",
+        "longer = np.vecdot(rho, rho - 2.0001 * q)",
     ),
     "blade of points": Bug(
         "extensions/street/rotors.py",

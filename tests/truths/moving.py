@@ -17,28 +17,33 @@ from isac_rt.world.swarm import Pose, Swarm
 from truths.case import Errors, case
 
 
+def echo_over(place: np.ndarray, ends: np.ndarray, rx: str = "B") -> PathSet:
+    """Echo of unit gain of a UAV U at a place (3,) between A and `rx` at `ends` (2, 3)."""
+    segments = place - ends
+    length = np.linalg.norm(segments, axis=1)
+    return make_paths(
+        gain=[1.0],
+        delay=[length.sum() / SPEED_OF_LIGHT],
+        departure=segments[:1] / length[0],
+        arrival=segments[1:] / length[1],
+        kind=PathKind.TARGET,
+        target=0,
+        points=place[None, None],
+        faces=[[-1]],
+        tx="A",
+        rx=rx,
+        epoch=0.0,
+        target_names=("U",),
+    )
+
+
 def _circling(
     w: Waveform, radius: float, turns: float, ends: np.ndarray, place: np.ndarray
 ) -> PathSet:
     """Paths over a point that circles about a UAV by so many turns a frame, without those of the
     UAV."""
     poses = {"A": Pose.at_rest(ends[0]), "B": Pose.at_rest(ends[1])}
-    legs = place - ends
-    length = np.linalg.norm(legs, axis=1)
-    echo = make_paths(
-        gain=[1.0],
-        delay=[length.sum() / SPEED_OF_LIGHT],
-        departure=legs[:1] / length[0],
-        arrival=legs[1:] / length[1],
-        kind=PathKind.TARGET,
-        target=0,
-        points=place[None, None],
-        faces=[[-1]],
-        tx="A",
-        rx="B",
-        epoch=0.0,
-        target_names=("U",),
-    )
+    echo = echo_over(place, ends)
     swarm = Swarm({"U": Uav(role="target", position_m=(place[0], place[1], place[2]))})
     turning = 2 * np.pi * turns / w.frame_duration
     numbers = (np.array([v]) for v in (radius, 0.3, turning, 1.0))

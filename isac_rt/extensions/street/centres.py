@@ -152,14 +152,15 @@ class MovingCentres:
                 of = name, model, self._attitude(name, paths.epoch)
                 for base in self._bases(paths, which, poses, of):
                     level = max(level, 10 * np.log10(base.power * over_noise[link]))
-            error = 2 * np.pi * (w.carrier_frequency + w.bandwidth) * model.jerk
+            frequency = w.carrier_frequency + w.bandwidth
+            error = 2 * np.pi * frequency * remainder(model.jerk, slot / 2)
             out.append(
                 {
                     "what": f"moving parts of {name}",
                     "modelled": f"{model.described()}, {level:.0f} dB over the noise of a cell; "
                     f"Doppler to {edge:.4g} Hz either side, slots show {widest:.4g} Hz",
                     "left_out": "jerk and turning within pieces of the frame",
-                    "estimate": max(PHASE_ERROR, error * slot**3 / (24 * SPEED_OF_LIGHT)),
+                    "estimate": max(PHASE_ERROR, error),
                     "unit": "rad",
                 }
             )
@@ -384,7 +385,7 @@ def segment(image: EndImage, time: np.ndarray, offset: Motion) -> Segment:
     centre = Motion(*(u - o for u, o in zip(uav, offset, strict=True)))
     of_uav, of_centre = _distance(uav), _distance(centre)
     rho, q = offset.place, uav.place
-    longer = _dot(rho, rho - 2 * q) / (of_centre[0] + of_uav[0])
+    longer = np.vecdot(rho, rho - 2 * q) / (of_centre[0] + of_uav[0])
     rate, accel = (a - b for a, b in zip(of_centre[1:], of_uav[1:], strict=True))
     turn = image.towards - centre.place / of_centre[0][..., None]
     return Segment(of_centre[0], longer, rate, accel, of_uav[0] / of_centre[0], turn)
@@ -393,21 +394,17 @@ def segment(image: EndImage, time: np.ndarray, offset: Motion) -> Segment:
 def _distance(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the length of a vector that moves, and its first and second derivative."""
     place, velocity, acceleration = motion
-    length = np.sqrt(_dot(place, place))
-    rate = _dot(place, velocity) / length
-    accel = _dot(velocity, velocity) + _dot(place, acceleration) - rate * rate
+    length = np.sqrt(np.vecdot(place, place))
+    rate = np.vecdot(place, velocity) / length
+    accel = np.vecdot(velocity, velocity) + np.vecdot(place, acceleration) - rate * rate
     return length, rate, accel / length
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("...i,...i", a, b)
-
-
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.sqrt(_dot(vectors, vectors))[..., None]
+    return vectors / np.sqrt(np.vecdot(vectors, vectors))[..., None]
 
 
-def remainder(speed: float, rate: float, half: float) -> float:
-    """Return the bound of the error in delay [s] of a point that circles at a speed [m/s] and a
-    rate [rad/s], at `half` [s] from the middle of a slot, out and back."""
-    return 2 * speed * rate**2 * half**3 / (6 * SPEED_OF_LIGHT)
+def remainder(jerk: float, half: float) -> float:
+    """Return the bound of the error in delay [s] of a point of some jerk [m/s^3], at `half` [s]
+    from the middle of a piece, out and back."""
+    return 2 * jerk * half**3 / (6 * SPEED_OF_LIGHT)
