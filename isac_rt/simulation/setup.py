@@ -658,11 +658,11 @@ def _extended(
     scenario: Scenario, model: Propagation, free: FreeSpace, city: CityMesh
 ) -> Propagation:
     """Return a propagation model with the scenario's boxes and weather."""
-    waveform, swarm = waveform_of(scenario.radio, scenario.array), swarm_of(scenario)
+    waveform = waveform_of(scenario.radio, scenario.array)
     hiding = city if scenario.propagation.model == "ray_traced" else None
-    if any(uav.box for uav in swarm.uavs.values()):
+    if any(uav.box for uav in free.uavs.values()):
         materials = {} if scenario.city is None else scenario.city.materials
-        model = extension("boxes")(swarm, materials, model, free, waveform, hiding)
+        model = extension("boxes")(swarm_of(scenario), materials, model, free, waveform, hiding)
     if scenario.weather is not None:
         model = extension("weather")(scenario.weather, model, free, waveform, hiding)
     return model

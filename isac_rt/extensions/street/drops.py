@@ -24,6 +24,7 @@ import numpy as np
 from scipy.special import spherical_jn, spherical_yn
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
+from isac_rt.propagation.segments.reflection import vertical
 
 DIAMETERS_MM = np.arange(0.025, 8.0, 0.05)
 """Middles of the classes of diameter; no larger drop holds together."""
@@ -163,7 +164,7 @@ class Drops:
         """
         cosine = np.clip((along * onward).sum(1), -1.0, 1.0)
         angle = np.rint(np.arccos(cosine) / np.pi * (ANGLES - 1)).astype(int)
-        sent, received = _upright(along), _upright(onward)
+        sent, received = vertical(along), vertical(onward)
         normal = np.cross(along, onward)
         size = np.linalg.norm(normal, axis=1, keepdims=True)
         # straight back and straight on every plane is the scattering plane
@@ -174,11 +175,3 @@ class Drops:
         s_1, s_2 = self.amplitudes[:, classes, angle]
         field = s_1 * across + s_2 * within
         return np.asarray(4 * np.pi / self._wave_number**2 * np.abs(field) ** 2)
-
-
-def _upright(direction: np.ndarray) -> np.ndarray:
-    """Return the vertical polarisation (K, 3) of waves along unit vectors (K, 3); along x where
-    these are vertical."""
-    vector = np.array([0.0, 0.0, 1.0]) - direction[:, 2:] * direction
-    size = np.linalg.norm(vector, axis=1, keepdims=True)
-    return np.where(size > 1e-6, vector / np.maximum(size, 1e-6), [1.0, 0.0, 0.0])

@@ -95,11 +95,8 @@ def blades_of(rotors: Rotors, waveform: Waveform, seed: int, name: str) -> Blade
     length, weight = blade_points(r.blade_length_m, 2 * np.pi * highest / SPEED_OF_LIGHT)
     rotor = np.arange(r.number)
     where = (rotor + 0.5) * 2 * np.pi / r.number
-    hub = (
-        r.arm_m
-        * (r.number > 1)
-        * np.stack([np.sin(where), np.cos(where), np.zeros(r.number)], axis=1)
-    )
+    arm = r.arm_m if r.number > 1 else 0.0
+    hub = arm * np.stack([np.sin(where), np.cos(where), np.zeros(r.number)], axis=1)
     start = generator(seed, "rotors", name).uniform(0, 2 * np.pi, r.number)
     phase = start[:, None] + np.arange(r.blades) * 2 * np.pi / r.blades
     turning = (-1.0) ** rotor * 2 * np.pi * r.rev_per_min / 60

@@ -96,13 +96,13 @@ HUMAN_DBSM, HEIGHT_M = -1.37, 1.75
 def walker_of_flight(extent: Extent, swarm: Swarm, seed: int, name: str) -> Walker:
     """Return the centres of a pedestrian who walks at the mean speed between the waypoints, with
     a phase drawn by name."""
-    flight, way_points = swarm.trajectories[name], swarm.uavs[name].waypoints
-    span = (0.0, 1.0) if way_points is None else (way_points[0].time_s, way_points[-1].time_s)
-    times = np.linspace(*span, PLACES)
+    flight, waypoints = swarm.trajectories[name], swarm.uavs[name].waypoints
+    begin, end = (0.0, 1.0) if waypoints is None else (waypoints[0].time_s, waypoints[-1].time_s)
+    times = np.linspace(begin, end, PLACES)
     way = np.linalg.norm(np.diff(flight.positions(times), axis=0), axis=1).sum()
     height = HEIGHT_M if extent.size_m is None else extent.size_m[2]
     start = generator(seed, "walker", name).uniform(0, 2 * np.pi)
-    return walker_of(height, float(way) / (span[1] - span[0]), 10 ** (HUMAN_DBSM / 10), start)
+    return walker_of(height, float(way) / (end - begin), 10 ** (HUMAN_DBSM / 10), start)
 
 
 def walker_of(height: float, speed: float, section: float, start: float) -> Walker:
