@@ -155,6 +155,7 @@ EXTENSIONS = {
     "with_foreign": "isac_rt.extensions.street.emitters:WithForeign",
     "excised": "isac_rt.extensions.street.excision:excised",
     "boxes": "isac_rt.extensions.street.boxes:Boxes",
+    "box_corners": "isac_rt.extensions.street.boxes:box_corners",
     "weather": "isac_rt.extensions.street.weather:Weathered",
     "weather_plan": "isac_rt.extensions.street.weather:plan_rows",
     "antenna_pattern": "isac_rt.extensions.antenna_files.patterns:antenna_pattern",

@@ -245,9 +245,9 @@ MAX_LINES = {
     "track": 1946,
     "scenario": 2140,
     "results": 3705,
-    "simulation": 3697,
+    "simulation": 3714,
     "sweep": 2785,
-    "views": 3582,
+    "views": 3660,
     "cli": 2313,
     "extensions": 14825,
 }

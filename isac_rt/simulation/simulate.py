@@ -11,13 +11,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.link import Link
 from isac_rt.plain import plain, restored
+from isac_rt.registry import extension
 from isac_rt.results.provenance import provenance
 from isac_rt.results.recorder import Figures, Recorder, Results
 from isac_rt.results.scoring import LinkResult
@@ -38,6 +40,10 @@ from isac_rt.simulation.stations import (
 from isac_rt.simulation.stopwatch import Stopwatch
 from isac_rt.track.parts import ReportedUav
 from isac_rt.track.terminal import Receiver
+from isac_rt.world.swarm import Swarm
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _LOG = logging.getLogger(__name__)
 Observe = Callable[[Frame, Link, IFCube], None]
@@ -100,7 +106,18 @@ def run(
     dataset = run.recorder.dataset().assign_attrs(
         provenance(scenario) | _attributes(run.setup, summary)
     )
-    return Results(dataset, summary, scenario, samples)
+    return Results(_with_boxes(dataset, run.setup.swarm), summary, scenario, samples)
+
+
+def _with_boxes(dataset: xr.Dataset, swarm: Swarm) -> xr.Dataset:
+    """Return a run's dataset with the corners of the UAVs' boxes, where there are any."""
+    if not any(uav.box for uav in swarm.uavs.values()):
+        return dataset
+    corners = extension("box_corners")(swarm, dataset.time.values)
+    about = {"units": "m", "long_name": "corners of the UAV's box in world axes"}
+    values = np.stack([*corners.values()], axis=1)
+    named = dataset.assign_coords(box=("box", np.array([*corners], object)))
+    return named.assign(box_corner=(("frame", "box", "corner", "axis"), values, about))
 
 
 def _attributes(setup: Setup, summary: Mapping[str, Any]) -> dict[str, str]:

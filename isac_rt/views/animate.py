@@ -17,8 +17,9 @@ from isac_rt.results.files import ResultsError
 from isac_rt.results.recorder import Results
 from isac_rt.results.swarm import SWARM
 from isac_rt.storage import write_whole
-from isac_rt.views.figures import scene_map
+from isac_rt.views.figures import footprint, outline, scene_map
 from isac_rt.views.maps import map_limits, range_doppler
+from isac_rt.views.scene import boxes_in
 from isac_rt.views.style import STYLE, colour_of
 from isac_rt.world.city.mesh import CityMesh
 
@@ -61,8 +62,8 @@ def animate(
         figure = Figure(figsize=(11, 5.2), dpi=100)
         left, right = figure.add_axes(_LEFT), figure.add_axes(_RIGHT)
         scene_map(left, d, city)
-        for line in left.lines:
-            line.set_alpha(0.25)
+        for drawn in (*left.lines, *left.patches):
+            drawn.set_alpha(0.25)
         moving = _Moving(left, d, observer)
         limits = np.array([map_limits(d, k, observer) for k in shown])
         low, high = limits[..., 0].min(axis=0), limits[..., 1].max(axis=0)
@@ -92,6 +93,12 @@ class _Moving:
         self._here = [
             ax.plot([], [], "o", color=colour_of(u), mec="white")[0] for u in range(count)
         ]
+        self._boxes = [
+            (corners, footprint(corners[0], colour_of(u)))
+            for u, corners in boxes_in(dataset).items()
+        ]
+        for _, patch in self._boxes:
+            ax.add_patch(patch)
         (self._tracks,) = ax.plot(
             [],
             [],
@@ -117,6 +124,8 @@ class _Moving:
         for u, (path, here) in enumerate(zip(self._paths, self._here, strict=True)):
             path.set_data(position[: frame + 1, u, 0], position[: frame + 1, u, 1])
             here.set_data(position[frame : frame + 1, u, 0], position[frame : frame + 1, u, 1])
+        for corners, patch in self._boxes:
+            patch.set_xy(outline(corners[frame]))
         positions = tracked_positions(self._d, frame, self._observer)
         self._tracks.set_data(positions[:, 0], positions[:, 1])
         for name, marks in self._fused.items():

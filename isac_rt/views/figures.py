@@ -15,8 +15,10 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 from matplotlib.ticker import AutoLocator, LogLocator
 from matplotlib.transforms import Bbox
+from scipy.spatial import ConvexHull
 
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.results.columns import MEASURES
@@ -25,6 +27,7 @@ from isac_rt.results.files import write_figure
 from isac_rt.results.recorder import Results
 from isac_rt.results.records import KINDS
 from isac_rt.views.maps import equivalent_range, range_doppler
+from isac_rt.views.scene import boxes_in
 from isac_rt.views.style import (
     KIND_COLOURS,
     KIND_MARKERS,
@@ -50,19 +53,22 @@ _UNITS = {
 
 
 def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Axes:
-    """The swarm from above: tracks, final positions by role, over the city's upward faces shaded by
-    height."""
+    """The swarm from above: tracks, final positions by role, boxes there, over the city's upward
+    faces shaded by height."""
     position = dataset.uav_position.values
     low, high = position[..., :2].min((0, 1)), position[..., :2].max((0, 1))
     margin = 0.35 * max(*(high - low), 40.0)
     if city is not None and city.num_faces:
         _footprints(ax, city, low - margin, high + margin)
+    boxes = boxes_in(dataset)
     for u in range(dataset.sizes["uav"]):
         x, y = position[:, u, 0], position[:, u, 1]
         role, colour = str(dataset.role.values[u]), colour_of(u)
         ax.plot(x, y, color=colour)
         size = 11 if role == "active" else 6
         ax.plot(x[-1], y[-1], ROLE_MARKERS[role], color=colour, ms=size, mec="white", mew=0.8)
+        if u in boxes:
+            ax.add_patch(footprint(boxes[u][-1], colour))
         facing = dataset.uav_attitude.values[-1, u, :2, 1]
         if role != "target":
             ax.annotate(
@@ -81,6 +87,17 @@ def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Ax
     labelled(ax, "east [m]", "north [m]")
     _name(ax, position[-1, :, :2], [str(name) for name in dataset.uav.values])
     return ax
+
+
+def footprint(corners: np.ndarray, colour: str) -> Polygon:
+    """Return the outline from above of a box with some corners (8, 3)."""
+    return Polygon(outline(corners), closed=True, fc=(colour, 0.4), ec=colour, lw=1.4)
+
+
+def outline(corners: np.ndarray) -> np.ndarray:
+    """Return the corners (K, 2) of the smallest convex figure about a box from above."""
+    flat = corners[:, :2]
+    return flat[ConvexHull(flat, qhull_options="QJ").vertices]
 
 
 _BESIDE = np.array(

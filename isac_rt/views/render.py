@@ -16,13 +16,14 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
 
 from isac_rt.frame.link import Link
 from isac_rt.kernels import views_raster
 from isac_rt.kernels.jit import twin_of
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.results.files import write_figure
-from isac_rt.views.scene import strongest
+from isac_rt.views.scene import BOX_FACES, boxes_of, strongest
 from isac_rt.views.style import KIND_COLOURS, ROLE_MARKERS, colour_of, words
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.passage import hits
@@ -246,6 +247,17 @@ class _Picture:
             for name in [kind.name.lower()]
         ]
 
+    def boxes(self, corners: Mapping[int, np.ndarray]) -> None:
+        """The sides of boxes (8, 3), by the UAV's index, that look here, the farthest first."""
+        for u, box in sorted(corners.items(), key=lambda one: -self.view.project(one[1])[0, 2]):
+            seen = self.view.project(box)
+            occluded = is_masked(box.mean(axis=0), self.view, self.depth)
+            order = sorted(BOX_FACES, key=lambda face: -seen[list(face), 2].mean())
+            for face in order[3:]:
+                side = Polygon(seen[list(face), :2], fc=colour_of(u), ec="white", lw=0.7, zorder=7)
+                side.set_alpha(_OCCLUDED_ALPHA if occluded else 0.9)
+                self.ax.add_patch(side)
+
     def swarm(self, swarm: Swarm, times: np.ndarray, time: float, below: Below) -> list[Line2D]:
         """Tracks, plumb lines to the ground, and a named marker where each UAV is at `time`.
         Returns the legend."""
@@ -296,6 +308,7 @@ def view_scene(
     ax.imshow(np.clip(image, 0, 1), origin="lower", extent=extent, interpolation="antialiased")
     drawn = _Picture(ax, view, depth)
     legend = drawn.paths(paths, swarm.poses(time))
+    drawn.boxes(boxes_of(swarm, time))
     level = float(tracks[..., 2].min() - 10)
 
     def below(point: np.ndarray) -> float:

@@ -1,5 +1,5 @@
 """The 3-D scene: city, flights and paths of a frame, or a finished run with a slider through its
-frames, its tracks and the paths of the frame whose ledger is nearest.
+frames, its tracks, its boxes and the paths of the frame whose ledger is nearest.
 
 It is made as plain mappings, for plotly's own objects take longer to build than the page.
 """
@@ -17,6 +17,7 @@ import xarray as xr
 
 from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind, PathSet
+from isac_rt.registry import extension
 from isac_rt.results.dataset import fused_positions, tracked_states
 from isac_rt.results.swarm import SWARM
 from isac_rt.runtime import needed
@@ -39,9 +40,11 @@ CREASE = np.deg2rad(20.0)
 """Faces that meet at more than this have an edge drawn between them [rad]."""
 ROLE_SYMBOLS = {"active": "diamond", "passive": "square", "target": "circle"}
 _AXES = "xyz"
+BOX_FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
+"""Corners round each face of a box, its corners in the order of their signs along its axes."""
 _SHOWN = frozenset(
     "uav role uav_position observer track_observer track_frame track_confirmed owner fused_frame "
-    "fused_owner fused_terminal fused_x fused_y fused_z".split()
+    "fused_owner fused_terminal fused_x fused_y fused_z box box_corner".split()
 )
 """What changes from frame to frame, beside paths. A look-up by name takes the longer the more
 variables a dataset has."""
@@ -133,6 +136,38 @@ def _uavs(names: Sequence[str], roles: Sequence[str], positions: np.ndarray) -> 
     }
     kind = {"type": "scatter3d", "mode": "markers+text", "name": "UAVs"}
     return {**kind, "text": list(names), "marker": marker, **points_of(positions)}
+
+
+def boxes_in(dataset: xr.Dataset) -> dict[int, np.ndarray]:
+    """Return the corners of the boxes of a run (F, 8, 3) [m], by the UAV's index."""
+    if "box" not in dataset.variables:
+        return {}
+    names, corners = dataset.uav.values.tolist(), dataset.box_corner.values
+    return {names.index(name): corners[:, b] for b, name in enumerate(dataset.box.values)}
+
+
+def boxes_of(swarm: Swarm, time: float) -> dict[int, np.ndarray]:
+    """Return the corners of a swarm's boxes (8, 3) [m] at a time [s], by the UAV's index."""
+    if not any(uav.box for uav in swarm.uavs.values()):
+        return {}
+    names, corners = list(swarm.uavs), extension("box_corners")(swarm, [time])
+    return {names.index(name): of_one[0] for name, of_one in corners.items()}
+
+
+def _boxes(corners: Mapping[int, np.ndarray]) -> Trace:
+    """Boxes (8, 3) [m] by the UAV's index."""
+    faces = np.array([t for a, b, c, d in BOX_FACES for t in ((a, b, c), (a, c, d))])
+    every = np.concatenate([faces + 8 * k for k in range(len(corners))])
+    return {
+        "type": "mesh3d",
+        "name": "boxes",
+        "hoverinfo": "skip",
+        "flatshading": True,
+        "showlegend": True,
+        "facecolor": [colour_of(u) for u in corners for _ in faces],
+        **points_of(np.concatenate([*corners.values()])),
+        **dict(zip("ijk", every.T.tolist(), strict=True)),
+    }
 
 
 def _fixed(
@@ -227,6 +262,8 @@ def scene_3d(
             label = f"{words(name)} ({count})"
             traces.append(_line(lines_of(lines), KIND_COLOURS[name], 3, label, **shown))
     roles = [uav.role for uav in swarm.uavs.values()]
+    if boxes := boxes_of(swarm, time):
+        traces.append(_boxes(boxes))
     traces.append(_uavs(names, roles, np.array([poses[name].position for name in names])))
     return go.Figure(traces, around | {"template": "plotly_white"})
 
@@ -273,7 +310,7 @@ class _Moving:
 
     def __init__(self, dataset: xr.Dataset) -> None:
         self._d = dataset[[str(name) for name in dataset.variables if name in _SHOWN]]
-        self._states = tracked_states(dataset)[:, :3]
+        self._states, self._boxes = tracked_states(dataset)[:, :3], boxes_in(dataset)
         shown = np.unique(dataset.path_kind.values)
         kinds = dataset.kind.values
         self._kinds = [int(k) for k in shown if kinds[k] not in ("diffuse", "leakage")]
@@ -282,6 +319,7 @@ class _Moving:
         self._owners = [str(name) for name in dataset.owner.values] if together else []
         self.names = [
             "UAVs",
+            *(["boxes"] if self._boxes else []),
             *(f"tracks of {observer}" for observer in dataset.observer.values),
             *(f"fused tracks of {'the ' * (name == SWARM)}{name}" for name in self._owners),
             *(f"{words(kinds[k])} paths" for k in self._kinds),
@@ -306,7 +344,8 @@ class _Moving:
             for name in self._owners
         ]
         nearest = self._kept[np.argmin(np.abs(self._kept - frame))] if self._kept.size else -1
-        traces = [uavs, *tracks, *fused, *self._paths.get(int(nearest), [])]
+        boxes = [_boxes({u: c[frame] for u, c in self._boxes.items()})] if self._boxes else []
+        traces = [uavs, *boxes, *tracks, *fused, *self._paths.get(int(nearest), [])]
         return [trace | {"name": n} for trace, n in zip(traces, self.names, strict=True)]
 
     def _mark(self, name: str) -> dict[str, Any]:

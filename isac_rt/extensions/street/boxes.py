@@ -22,14 +22,14 @@ A path lives while both ends stand before the face and the point of reflection i
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from isac_rt.extensions.street.centres import Attitude, attitude_about
+from isac_rt.extensions.street.centres import Attitude, attitude_about, body_axes
 from isac_rt.extensions.street.occlusion import Occlusion
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
@@ -181,6 +181,21 @@ class Boxes:
             points=point[:, None],
             faces=np.full((1, 1), -1),
         )
+
+
+def box_corners(swarm: Swarm, times: Sequence[float]) -> dict[str, np.ndarray]:
+    """Return the corners (T, 8, 3) of a swarm's boxes at some times [s], by UAV."""
+    return {
+        name: np.array(
+            [
+                swarm.trajectories[name].pose(t).position
+                + (CORNERS * uav.box.size_m / 2) @ body_axes(swarm, name, t).T
+                for t in times
+            ]
+        )
+        for name, uav in swarm.uavs.items()
+        if uav.box is not None
+    }
 
 
 def face_image(end: Pose, box: Box, axis: int, sign: float) -> Pose:

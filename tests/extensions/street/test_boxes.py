@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_run import fake_run
+from matplotlib.figure import Figure
 from scipy.integrate import quad
 from scipy.special import fresnel
 
@@ -19,6 +21,10 @@ from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.runtime import UserError
+from isac_rt.simulation.simulate import _with_boxes
+from isac_rt.views.figures import scene_map
+from isac_rt.views.scene import moving_scene, scene_3d
+from isac_rt.world.city.mesh import empty_city
 from isac_rt.world.settings import Box, Uav, Waypoint
 from isac_rt.world.swarm import Swarm
 
@@ -147,7 +153,7 @@ def test_a_mirror_that_turns_away_lives_no_longer():
     frame."""
     swarm, model = stage(turning((-25.0, 0.0, 25.0)))
     edges = 0
-    for epoch in np.arange(0.05, 0.95, 2 * HALF):
+    for epoch in (0.05, *np.arange(0.12, 0.15, 2 * HALF), 0.4, *np.arange(0.74, 0.77, 2 * HALF)):
         paths = mirrors(swarm, model, epoch)
         times = np.linspace(-HALF, HALF, 41)
         ours = [any((paths.begin <= t) & (t < paths.end)) for t in times]
@@ -257,3 +263,31 @@ def test_a_car_hides_a_pedestrian_and_flashes():
     assert 1e-5 * level[0] > level[1] < 1e-5 * level[2]
     assert flash[0] == flash[2] == []
     assert flash[1] == pytest.approx([2 * (9.1 - 3.6 - 0.9) / SPEED_OF_LIGHT])
+
+
+def test_figures_draw_the_box_where_it_is():
+    """Corners by hand: 6 m ahead along the course, 2 m beside it, in the map, the page and the
+    scene of a run. Planted bugs: width and length exchanged; the box of the last frame in all."""
+    course = np.array([0.6, 0.8, 0.0])
+    car = box_of((2.0, 6.0, 1.0), position_m=(5, 3, 0.5), velocity_mps=tuple(10 * course))
+    run, city = fake_run(), empty_city("", np.zeros(3))
+    uavs = {name: Uav(role="active", position_m=(0, 0, 5)) for name in ("AT", "PT1")}
+    swarm = Swarm({**uavs, "U1": car}, 1.0)
+    dataset = _with_boxes(run.dataset, swarm)
+    assert "box" not in run.dataset.variables
+    time, beside = run.dataset.time.values[4], np.array([0.8, -0.6, 0.0])
+    corners = [
+        np.array([5, 3, 0.5]) + 10 * course * time + 3 * a * course + b * beside + [0, 0, 0.5 * c]
+        for a in (-1, 1)
+        for b in (-1, 1)
+        for c in (-1, 1)
+    ]
+    figure = moving_scene(dataset, city)
+    drawn = next(t for t in figure["frames"][4]["data"] if t["name"] == "boxes")
+    still = next(t for t in scene_3d(city, swarm, [0.0], time, {}).data if t.name == "boxes")
+    for found in ([drawn[a] for a in "xyz"], [still[a] for a in "xyz"]):
+        apart = np.linalg.norm(np.transpose(found)[:, None] - corners, axis=2)
+        assert apart.min(axis=0).max() < 0.01 and apart.shape == (8, 8)
+    outline = scene_map(Figure().subplots(), dataset.isel(frame=slice(5))).patches[0].get_xy()
+    near = np.linalg.norm(outline[:, None] - np.array(corners)[:, :2], axis=2).min(axis=1)
+    assert near.max() < 1e-6 and len(outline) >= 5
