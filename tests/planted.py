@@ -334,8 +334,8 @@ OF_CASES = {
     ),
     "doppler edge of a rotor": Bug(
         "extensions/street/centres.py",
-        '"delay_rate": there.rate + back.rate',
-        '"delay_rate": 2 * there.rate',
+        "rate = (there.rate + back.rate) / SPEED_OF_LIGHT",
+        "rate = 2 * there.rate / SPEED_OF_LIGHT",
     ),
     "lines of a circling point": Bug(
         "extensions/street/centres.py",
@@ -344,8 +344,8 @@ OF_CASES = {
     ),
     "blade of points": Bug(
         "extensions/street/rotors.py",
-        "LEFT_OUT) + 1) // 2",
-        "LEFT_OUT) + 1) // 3",
+        "[0] + 1) // 2",
+        "[0] + 1) // 3",
     ),
     "cross section of a vehicle and an agv": Bug(
         "extensions/street/extent.py",

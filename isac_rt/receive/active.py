@@ -8,7 +8,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload
 from isac_rt.frame.schedule import codes_of
-from isac_rt.receive.chain import Refiner, detector_of, filter_of, refiner_of
+from isac_rt.receive.chain import Refiner, detector_of, excised, filter_of, refiner_of
 from isac_rt.receive.clutter_filter import ClutterFilter
 from isac_rt.receive.joint.leakage import without_leakage
 from isac_rt.receive.joint.moments import Moments
@@ -121,4 +121,4 @@ def receive_active(
     (array([5.]), array([4.]))
     """
     chain = ActiveReceiver.of(antennas, settings)
-    return chain.receive(cube, payload, Hints(clutter), maps=maps)
+    return chain.receive(excised(cube, settings), payload, Hints(clutter), maps=maps)

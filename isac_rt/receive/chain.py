@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import cast
 
 import numpy as np
 
+from isac_rt.frame.cube import IFCube
 from isac_rt.receive.clutter_filter import RUN_CELLS, ClutterFilter
 from isac_rt.receive.estimate import Estimator
 from isac_rt.receive.joint.moments import Moments
@@ -21,7 +23,7 @@ from isac_rt.receive.sense import Cfar, Detector
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.symbols import ByPowers
 from isac_rt.receive.types import Detections
-from isac_rt.registry import DETECTORS, PASSIVE_DETECTORS, SYMBOL_READERS
+from isac_rt.registry import DETECTORS, PASSIVE_DETECTORS, SYMBOL_READERS, extension
 
 Refiner = Callable[[Moments, Detections], tuple[Detections, np.ndarray]]
 """From the sums of samples and near estimates to better ones and the paths' powers."""
@@ -40,6 +42,12 @@ CFARS: dict[str, Callable[[Receivers, Estimator], Cfar]] = {
 }
 ESTIMATORS = {"grid": Estimator(on_grid=True), "local": Estimator(), "joint": Estimator()}
 REFINERS: dict[str, Refiner | None] = {"grid": None, "local": None, "joint": refine_jointly}
+
+
+def excised(cube: IFCube, settings: Receivers) -> IFCube:
+    """Return samples without foreign chirps, where the settings ask for that."""
+    rate = settings.excision_rate
+    return cube if rate is None else cast(IFCube, extension("excised")(cube, rate))
 
 
 def filter_of(settings: Receivers) -> ClutterFilter | None:

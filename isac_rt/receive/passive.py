@@ -10,7 +10,7 @@ import numpy as np
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.receive.chain import Refiner, passive_detector_of, reader_of, refiner_of
+from isac_rt.receive.chain import Refiner, excised, passive_detector_of, reader_of, refiner_of
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.joint.neighbours import separate
@@ -398,7 +398,7 @@ def receive_passive(
     <Reception 1 detections, line of sight, no data decoded>
     """
     chain = PassiveReceiver.of(antennas, settings, dpsk_order, groups)
-    return chain.receive(cube, prediction, modulated, maps=maps)
+    return chain.receive(excised(cube, settings), prediction, modulated, maps=maps)
 
 
 def _off(detections: Detections, paths: Detections, known: Known) -> np.ndarray:

@@ -50,6 +50,9 @@ class Emitter(Node):
     offset_us: Finite | None = None
     """Start of its first chirp, or of the first of each burst, after time 0 [us]. null, the
     default: drawn within one repetition by `seed` and name."""
+    clock_drift_ppm: Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)] = 0.0
+    """How much later its clock gets [microseconds per second]: its chirps slide against ours, its
+    frequencies are lower by as much. Crystals: 20. By default none."""
     burst_chirps: Annotated[int, Field(ge=1, le=100_000)] | None = None
     """Chirps in a burst. null, the default: it sends without a pause."""
     burst_interval_s: Positive | None = None
@@ -69,14 +72,14 @@ class Emitter(Node):
         if not any(self.boresight):
             yield Problem((("boresight",),), "points nowhere; give a direction such as [0, 1, 0]")
         if self.slope_mhz_per_us * self.ramp_us * 1e6 + self.start_hz <= 0:
-            said = "ends below 0 Hz; shorten the ramp, or give start_hz in hertz"
-            yield Problem((("ramp_us",), ("start_hz",)), said)
+            message = "ends below 0 Hz; shorten the ramp, or give start_hz in hertz"
+            yield Problem((("ramp_us",), ("start_hz",)), message)
         if (self.burst_chirps is None) != (self.burst_interval_s is None):
-            said = "goes with burst_interval_s, and this with it; state both or none"
-            yield Problem((("burst_chirps",), ("burst_interval_s",)), said)
+            message = "goes with burst_interval_s, and this with it; state both or none"
+            yield Problem((("burst_chirps",), ("burst_interval_s",)), message)
             return
         if self.burst_chirps is not None and self.burst_interval_s is not None:
             length = self.burst_chirps * (self.ramp_us + self.idle_us) * 1e-6
             if length > self.burst_interval_s * (1 + 1e-12):
-                said = f"is shorter than a burst, which lasts {length:.4g} s; lengthen it"
-                yield Problem((("burst_interval_s",), ("burst_chirps",)), said)
+                message = f"is shorter than a burst, which lasts {length:.4g} s; lengthen it"
+                yield Problem((("burst_interval_s",), ("burst_chirps",)), message)

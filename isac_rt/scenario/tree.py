@@ -240,6 +240,7 @@ class Scenario(Node):
             ramp_us=times.chirp * 1e6,
             idle_us=(times.slot - times.chirp) * 1e6,
             offset_us=late * 1e6,
+            clock_drift_ppm=uav.clock_drift_ppm,
             burst_chirps=self.radio.chirps_per_frame,
             burst_interval_s=self.frame_interval_s,
         )

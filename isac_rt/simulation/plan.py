@@ -303,7 +303,8 @@ def turning_bound(
 
     For motion by v t of the source and of the UAV, the delay of an element at r changes by
     :math:`r\,v t/(R - v t - r)` at most against that of the centroid, R the radius of the
-    wavefront. Rotation of the UAV moves its elements in addition."""
+    wavefront. Rotation of the UAV moves its elements in addition. Scatterers without a point of a
+    surface, such as rain, are drawn anew in each frame and have no direction to keep: 0."""
     t, k = frame_reach(waveform), 2 * np.pi * _highest(waveform) / SPEED_OF_LIGHT
     poses = swarm.poses(paths.epoch)
     flown_distance = {
@@ -327,7 +328,8 @@ def turning_bound(
         # beside the UAV itself a direction may turn to the opposite one
         out += k * np.where(rest > flown / 2, r * flown / np.maximum(rest, flown / 2), 2 * r)
         out += k * max(float(np.linalg.norm(at - here, axis=1).max()) for at in then)
-    return np.where(paths.kind == PathKind.LEAKAGE, 0.0, out)
+    drawn = (paths.kind == PathKind.DIFFUSE) & ~np.isfinite(paths.points).any(axis=(1, 2))
+    return np.where(drawn | (paths.kind == PathKind.LEAKAGE), 0.0, out)
 
 
 def flight_of_light(paths: PathSet, waveform: Waveform, speed: float) -> float:

@@ -89,8 +89,6 @@ class Station:
         """Receive one frame and track, with targets reported by other terminals. Runs in a worker
         thread and changes the state of this station only."""
         begun = time.thread_time()
-        if (rate := self.receivers.excision_rate) is not None:
-            cube = extension("excised")(cube, rate)
         timetable, (tx, rx) = self.setup.timetable, self.link
         when = timetable.epoch(frame.number, tx)
         pose = self.setup.believed(rx, self.setup.swarm.trajectories[rx].pose(when))

@@ -20,6 +20,7 @@ from isac_rt.frame.payload import Payload
 from isac_rt.frame.waveform import Waveform
 from isac_rt.plain import Stateful
 from isac_rt.receive.active import ActiveReceiver
+from isac_rt.receive.chain import excised
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import (
@@ -149,6 +150,7 @@ class ActiveTerminal(Stateful):
         reported_poses : poses that other terminals report, for its calibration
         reports : UAVs that others report
         """
+        cube = excised(cube, self._receiver.settings)
         cube = self.equipment.hardware.correct(cube, time)
         before = self.state.correction
         if clutter is not None and before is not None:
@@ -249,6 +251,7 @@ class PassiveTerminal(Stateful):
         sender : pose that its data report, which counts once a frame was read
         reports : UAVs that others report
         """
+        cube = excised(cube, self._receiver.settings)
         cube = self.equipment.hardware.correct(cube, time)
         self.reference.predict(time)
         self.tracker.predict(time)

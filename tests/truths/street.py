@@ -19,6 +19,8 @@ from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
 from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.propagation.settings import Weather
+from isac_rt.scenario.emitters import Emitter
+from isac_rt.scenario.swarm import Uav
 from isac_rt.world.swarm import Pose
 from truths.case import Errors, case
 
@@ -56,9 +58,9 @@ def attenuation_by_rain() -> Errors:
     """Rain takes what the recommendation says: k, alpha and the loss, for any elevation and
     polarisation."""
     for row in table("ITURP838-3_rain_specific_attenuation.csv"):
-        elevation, f, rain, tilt, *said = map(float, row)
+        elevation, f, rain, tilt, *printed = map(float, row)
         k, alpha = rain_coefficients(f * 1e9, np.radians(elevation), np.radians(tilt))
-        yield from np.abs(np.array([k, alpha, k * rain**alpha]) - said)
+        yield from np.abs(np.array([k, alpha, k * rain**alpha]) - printed)
 
 
 def rainy(antennas: Antennas, settings: Weather | None = None) -> tuple[Weathered, FreeSpace]:
@@ -90,8 +92,8 @@ def echoes_of_rain() -> Errors:
     for near, far in ((4, 10), (10, 20), (40, 80)):
         ranges = [p.delay * SPEED_OF_LIGHT / 2 for p in found]
         power = [p.power[(r > near) & (r < far)].sum() for p, r in zip(found, ranges, strict=True)]
-        said = free.wavelength**2 * 4 * weather.drops.reflectivity * (1 / near - 1 / far)
-        yield abs(np.mean(power) / (said / (16 * np.pi**2)) - 1)
+        integral = free.wavelength**2 * 4 * weather.drops.reflectivity * (1 / near - 1 / far)
+        yield abs(np.mean(power) / (integral / (16 * np.pi**2)) - 1)
 
 
 def one_path(delay: float = 150e-9) -> PathSet:
@@ -126,9 +128,12 @@ def filtered(samples: np.ndarray, rate: float) -> np.ndarray:
     return np.fft.ifft(np.fft.fft(samples) * gain)
 
 
-def dechirped(train: Train, paths: PathSet, ear: ReceiveArray) -> np.ndarray:
+def dechirped(
+    train: Train, paths: PathSet, ear: ReceiveArray, drift_ppm: float = 0.0
+) -> np.ndarray:
     """Samples (M, L_rx, P, N) of one path: both chirps at 20 times the rate with the true delay of
-    each element at each instant, multiplied, filtered, and every 20th taken."""
+    each element at each instant, multiplied, filtered, and every 20th taken. The chirps are those
+    of a clock that gets so much later."""
     w, rate = WAVEFORM, OVERSAMPLING * WAVEFORM.sampling_rate
     beyond = 400 * OVERSAMPLING  # 20 us before and after the samples
     u = w.fast_time[0] + np.arange(-beyond, w.num_samples * OVERSAMPLING + beyond) / rate
@@ -142,7 +147,8 @@ def dechirped(train: Train, paths: PathSet, ear: ReceiveArray) -> np.ndarray:
             delay = delay + paths.delay_accel[0] * since**2 / 2
             for rx, place in enumerate(ear.pose.to_world(ear.antennas.rx_positions)):
                 farther = np.linalg.norm(source - place) - np.linalg.norm(source)
-                sent = time - delay - farther / SPEED_OF_LIGHT - train.offset
+                sent = (time - delay - farther / SPEED_OF_LIGHT) / (1 + drift_ppm * 1e-6)
+                sent -= train.offset
                 v = (sent + 1 / rate) % train.repetition - 1 / rate
                 phase = w.carrier_frequency * u + w.slope * u**2 / 2
                 phase = phase - train.frequency * v - train.slope * v**2 / 2
@@ -191,6 +197,15 @@ FOREIGN = (
     ),
 )
 """Slower, falling, steeper, of nearly the same slope, and a tone of 11.6 MHz."""
+SAME = Emitter.model_construct(
+    start_hz=WAVEFORM.carrier_frequency,
+    slope_mhz_per_us=WAVEFORM.slope * 1e-12,
+    ramp_us=WAVEFORM.chirp_duration * 1e6,
+    idle_us=(WAVEFORM.slot_duration - WAVEFORM.chirp_duration) * 1e6,
+    offset_us=2.75,
+    clock_drift_ppm=-40.0,
+)
+"""A radar of the receiver's chirp."""
 
 
 @case(
@@ -201,8 +216,11 @@ FOREIGN = (
 def foreign_chirps() -> Errors:
     """A foreign chirp crosses the IF band as it would on the air, at any slope."""
     ear, paths = receiver(), one_path()
-    for train in FOREIGN:
-        truth = dechirped(train, paths, ear)
+    own_clock = Train.of(SAME, "E", 0)
+    late = own_clock.as_received(SAME, Uav.model_construct(role="active"))
+    trains = [*((train, train, 0.0) for train in FOREIGN), (late, own_clock, SAME.clock_drift_ppm)]
+    for train, sent, drift in trains:
+        truth = dechirped(sent, paths, ear, drift)
         found = np.zeros(truth.shape, complex)
         add_foreign(found, WAVEFORM, Arrival(train, 2.0, paths), ear, Reference(START))
         error = np.moveaxis(np.abs(found - truth), 1, 0)[:, ~near_an_end(train, paths)]

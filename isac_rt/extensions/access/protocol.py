@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 import numpy as np
 
@@ -57,8 +58,9 @@ from isac_rt.randomness import generator, seed_sequence
 from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections
+from isac_rt.registry import extension
 from isac_rt.signal.if_signal import noisy_if_signal
-from isac_rt.signal.methods import Auto
+from isac_rt.signal.methods import Auto, Method
 from isac_rt.signal.noise import WhiteNoise
 from isac_rt.simulation.setup import Setup
 from isac_rt.world.swarm import Pose
@@ -92,6 +94,7 @@ class Network:
     external_clock : whether stage 2 is left out
     dpsk_order : of the data of those that have joined
     start : of the first frame [s]
+    foreign : what arrives of emitters at terminals, by poses, time and their names; None: nothing
     """
 
     waveform: Waveform
@@ -108,6 +111,7 @@ class Network:
     external_clock: bool = False
     dpsk_order: int = 8
     start: float = 0.0
+    foreign: Callable[[Mapping[str, Pose], float, list[str]], Mapping[str, Any]] | None = None
 
     @property
     def names(self) -> list[str]:
@@ -239,16 +243,14 @@ class _Air:
                 t, clock_offset=t.clock_offset + difference, clock_drift=clock.drift - own.drift
             )
             links.append((shifted, paths[Link(t.name, name)]))
-        start = self.time - w.frame_duration / 2 + first_block * w.group_spacing
+        start, noise = self.time - w.frame_duration / 2, n.noise_power[name]
+        reference = Reference(start + first_block * w.group_spacing, first_block, n.schedule)
+        array, method = ReceiveArray(poses[name], n.arrays.of(name)), cast(Method, Auto(noise))
+        if n.foreign is not None:
+            arrivals = n.foreign(poses, self.time, [name])[name]
+            method = extension("with_foreign")(method, arrivals, array, reference, noise)
         words = seed_sequence(n.seed, "access", "noise", name, self.frame).generate_state(2)
-        return noisy_if_signal(
-            w,
-            links,
-            ReceiveArray(poses[name], n.arrays.of(name)),
-            Reference(start, first_block, n.schedule),
-            Auto(n.noise_power[name]),
-            WhiteNoise(n.noise_power[name], words),
-        )
+        return noisy_if_signal(w, links, array, reference, method, WhiteNoise(noise, words))
 
 
 def establish(network: Network) -> Establishment:
@@ -497,5 +499,6 @@ def establish_links(setup: Setup, clocks: Mapping[str, Clock]) -> Establishment:
         amplitudes=setup.plan.amplitudes,
         external_clock=s.access.synchronisation != "two_round",
         dpsk_order=s.modulation.dpsk_order,
+        foreign=None if setup.emitters is None else setup.emitters.arrivals,
     )
     return establish(replace(network, start=-network.longest))

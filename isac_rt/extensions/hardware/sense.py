@@ -19,7 +19,6 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.sense import describe
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Detections, Reception
-from isac_rt.registry import extension
 from isac_rt.track.filter import Ambiguity
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import Tracker, in_plane
@@ -49,8 +48,6 @@ def sense(capture: Capture, settings: Receivers) -> Reception:
                 f"receivers.{key}: {value} is not made for a measured frame, which comes without a "
                 f"city's mesh; use {' or '.join(able)}"
             )
-    if settings.excision_rate is not None:
-        cube = extension("excised")(cube, settings.excision_rate)
     found = receive_active(
         cube, unmodulated(cube.waveform), _antennas(capture), settings, maps=True
     )

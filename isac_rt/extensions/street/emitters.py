@@ -15,9 +15,9 @@ edges of the band; a crossing of 1 us is shorter than the filter's memory. Refer
 `MARGIN` transients longer than the samples on both sides; ends of foreign chirps far outside of the
 band leave no click.
 
-Chirps of one emitter begin with the same phase; it sends from one place with the pattern of one
-element. Paths are traced from it as from a terminal, with one bounce at most, and lose what weather
-takes.
+Chirps of one emitter begin with the same phase and are timed by its own clock, whose drift divides
+its frequencies and multiplies its times; it sends from one place with the pattern of one element.
+Paths are traced from it as from a terminal, with one bounce at most, and lose what weather takes.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ from isac_rt.propagation.pathset import PathSet
 from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import generator
 from isac_rt.scenario.emitters import Emitter
+from isac_rt.scenario.swarm import Uav
 from isac_rt.scenario.tree import Scenario
 from isac_rt.signal.exact import filter_gain
 from isac_rt.signal.methods import Method
@@ -95,6 +96,20 @@ class Train:
         slope, interval = e.slope_mhz_per_us * 1e12, e.burst_interval_s or 0.0
         return cls(
             e.start_hz, slope, e.ramp_us * 1e-6, repetition, offset, e.burst_chirps, interval
+        )
+
+    def as_received(self, sender: Emitter, receiver: Uav) -> Train:
+        """Return the chirps, which are timed by their sender's clock, on a receiver's clock."""
+        sent, received = (1 + end.clock_drift_ppm * 1e-6 for end in (sender, receiver))
+        stretch = sent / received
+        return replace(
+            self,
+            frequency=self.frequency / stretch,
+            slope=self.slope / stretch**2,
+            duration=self.duration * stretch,
+            repetition=self.repetition * stretch,
+            offset=self.offset * stretch - receiver.clock_offset_s / received,
+            interval=self.interval * stretch,
         )
 
     def starts(self, begin: float, end: float) -> np.ndarray:
@@ -178,9 +193,9 @@ class Emitters:
             if air is not None:
                 found = replace(found, gain=found.gain * 10 ** (-air.loss_db(found) / 20))
             amplitude = 10 ** ((self._scenario.emitters[link.tx].power_dbm - 30) / 20)
-            train, late = self._trains[link.tx], self._scenario.swarm[link.rx].clock_offset_s
-            by_clock = replace(train, offset=train.offset - late)
-            out.setdefault(link.rx, []).append(Arrival(by_clock, amplitude, found))
+            ends = self._scenario.emitters[link.tx], self._scenario.swarm[link.rx]
+            train = self._trains[link.tx].as_received(*ends)
+            out.setdefault(link.rx, []).append(Arrival(train, amplitude, found))
         return out
 
 
@@ -311,8 +326,8 @@ def crossing_samples(waveform: Waveform, found: Crossings) -> tuple[np.ndarray, 
     guard = margin / 4  # where the window's ends click
     within = found.in_band(-w.filter_transition, rate + w.filter_transition)
     about = found.in_band(-CLICKS * rate, (1 + CLICKS) * rate)
-    begin = np.minimum(within[0] - margin, about[0] - guard)
-    end = np.maximum(within[1] + margin, about[1] + guard)
+    begin = np.minimum(within[0] - margin, about[0] - 2 * guard)
+    end = np.maximum(within[1] + margin, about[1] + 2 * guard)
     size = int(np.ceil((end - begin).max() * rate))
     first = np.floor((begin - w.fast_time[0]) * rate).astype(int)
     if size > (most := w.num_samples + 2 * int(np.ceil(margin * rate))):
@@ -355,14 +370,13 @@ def add_foreign(
                 some = found.select(slice(first, first + AT_ONCE))
                 made, sample = crossing_samples(w, some)
                 for row, chirp in enumerate(some.chirp):
-                    here = np.arange(w.num_samples)[
-                        max(sample[row], 0) : max(sample[row] + made.shape[1], 0)
-                    ]
-                    u = w.fast_time[here]
+                    begin, end = np.clip((0, made.shape[1]) + sample[row], 0, w.num_samples)
+                    u = w.fast_time[begin:end]
                     beat = np.clip(some.frequency[row] + some.slope[row] * u, 0, w.sampling_rate)
                     arriving = w.carrier_frequency + w.slope * u - beat
                     turned = np.exp(2j * np.pi * (elements[k][:, None] * arriving))
-                    out[m, :, chirp, here] += weight * (turned * made[row, here - sample[row]]).T
+                    crossing = weight * made[row, begin - sample[row] : end - sample[row]]
+                    out[m, :, chirp, begin:end] += turned * crossing
 
 
 def plan_row(
@@ -381,8 +395,13 @@ def plan_row(
         add_foreign(foreign, waveform, some, receiver, reference)
     over = np.abs(foreign) ** 2 / noise
     rise, most = 10 * np.log10(1 + over.mean()), 10 * np.log10(over.max() + 1e-40)
-    said = f"floor {rise:.2g} dB up: {100 * (over > 1).mean():.2g} % of the samples over the noise"
+    level = f"floor {rise:.2g} dB up: {100 * (over > 1).mean():.2g} % of the samples over the noise"
     if over.max() > 1:
-        said += f", {most:.3g} dB at most"
+        level += f", {most:.3g} dB at most"
     left = 10 * np.log10(WEAKEST)
-    return {"modelled": said, "left_out": "two bounces, clutter", "estimate": left, "unit": "dB"}
+    return {
+        "modelled": level,
+        "left_out": "weak paths; two bounces, clutter",
+        "estimate": left,
+        "unit": "dB",
+    }

@@ -191,14 +191,14 @@ def plan_rows(
     path."""
     frequency = waveform.effective_carrier
     air, rain = Air(settings, frequency), settings.rain_mm_per_h
-    said = f"gas {air.gas:.3g} dB/km, rain {float(air.rain(0.0)):.3g} dB/km"
+    attenuation = f"gas {air.gas:.3g} dB/km, rain {float(air.rain(0.0)):.3g} dB/km"
     if rain:
         drops = Drops(rain, frequency, settings.temperature_c + ZERO_CELSIUS)
-        said += f" and {10 * np.log10(drops.reflectivity):.1f} dB of echo per metre"
+        attenuation += f" and {10 * np.log10(drops.reflectivity):.1f} dB of echo per metre"
     rows = []
     for row in budgets:
         passes = 2 if len(set(row.link.split("->"))) == 1 else 1
         loss = (air.gas + float(air.rain(0.0))) * passes * row.distance_m / 1e3
-        cost = f"{said}: {loss:.3g} dB of the {row.reference}"
+        cost = f"{attenuation}: {loss:.3g} dB of the {row.reference}"
         rows.append({"what": "weather", "modelled": cost, "link": row.link})
     return [one | {"left_out": "in what receivers expect"} for one in rows]

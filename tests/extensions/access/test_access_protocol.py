@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from isac_rt.extensions.access.ook import Message
-from isac_rt.extensions.access.protocol import Network, establish
+from isac_rt.extensions.access.protocol import Network, _Air, establish
+from isac_rt.extensions.street.emitters import Arrival, Train, add_foreign
 from isac_rt.frame.antennas import Antennas, Arrays
 from isac_rt.frame.clock import Clock
+from isac_rt.frame.cube import ReceiveArray, Reference
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, make_paths
@@ -134,3 +136,23 @@ def test_noise_alone_makes_no_link():
     assert got.missed_announcements == 1
     assert not got.links["A", "P"].acknowledged
     assert got.false_blocks == {"A": 0}
+
+
+def test_emitters_are_received_in_the_blocks_of_the_stage():
+    """A foreign radar at A's place, at P in blocks 3 to 5 of frame 2. Planted bug: the reference of
+    the slot's first block; paths of the first frame."""
+    train = Train(W.carrier_frequency, 0.8 * W.slope, 20e-6, 23e-6, 1e-6, None, 0.0)
+
+    def foreign(poses, time, names):
+        paths = scene_of()(time, [("A", "P")])[1]["A", "P"]
+        return {name: [Arrival(train, 50.0, paths)] for name in names}
+
+    disturbed, quiet = _Air(network(foreign=foreign, start=-0.2)), _Air(network(start=-0.2))
+    disturbed.frame = quiet.frame = 2
+    extra = disturbed.received("P", 3).samples - quiet.received("P", 3).samples
+    time = -0.2 + 2.5 * W.frame_duration
+    poses, truth = scene_of()(time, [])[0], np.zeros(extra.shape, complex)
+    array = ReceiveArray(poses["P"], disturbed.n.arrays.of("P"))
+    start = Reference(-0.2 + 2 * W.frame_duration + 3 * W.group_spacing)
+    add_foreign(truth, W, foreign(poses, time, ["P"])["P"][0], array, start)
+    assert np.linalg.norm(extra - truth) < 1e-3 * np.linalg.norm(truth)

@@ -25,7 +25,7 @@ from isac_rt.simulation.audit import make_plan
 from isac_rt.simulation.setup import prepare
 from isac_rt.world.swarm import Pose
 
-SCENE = Path(__file__).parents[3] / "scenes" / "foreign_radar.yaml"
+SCENE = Path(__file__).parents[3] / "scenes" / "foreign_swarm.yaml"
 OPEN = ["propagation.model=free_space", "clutter.model=none"]
 
 
@@ -74,12 +74,12 @@ def test_the_power_that_arrives_is_by_friis_and_both_patterns():
     boresight = np.array([-0.1, -1, 0.15]) / np.linalg.norm([-0.1, -1, 0.15])
     sent = 10**1.2 * (line @ boresight / distance) ** (10**1.2 / 2 - 1)
     received = setup.antennas.element_gain(own.to_body(-line / distance))
-    said = 10 ** ((14 - 30) / 10) * sent * received
-    said *= (setup.waveform.wavelength / (4 * np.pi * distance)) ** 2
+    friis = 10 ** ((14 - 30) / 10) * sent * received
+    friis *= (setup.waveform.wavelength / (4 * np.pi * distance)) ** 2
     arrival = dry.foreign["AT"][0]
     los = arrival.paths.kind == PathKind.LINE_OF_SIGHT
     power = arrival.amplitude**2 * arrival.paths.power[los]
-    assert power == pytest.approx([said], rel=1e-9)
+    assert power == pytest.approx([friis], rel=1e-9)
     assert arrival.paths.delay_rate[los] * SPEED_OF_LIGHT == pytest.approx(
         [(own.velocity - np.array([0, -11.2, 0])) @ line / distance]
     )
@@ -106,15 +106,16 @@ def test_the_city_reflects_foreign_chirps_once():
 def test_samples_hold_what_arrives_and_the_plan_says_how_much():
     """Samples with the emitters less those without are the sum over emitters; without emitters a
     frame has none of them. Planted bug: the strongest path left out; noise added twice."""
-    setup = prepare(load(SCENE, [*OPEN, "frames=5"]))
-    frame, link = setup.frame(4), ("AT", "AT")
-    assert prepare(load(SCENE, [*OPEN, "emitters={}"])).frame(2).foreign == {}
+    small = [*OPEN, "frames=4", "radio.chirps_per_frame=24", "radio.samples_per_chirp=512"]
+    setup = prepare(load(SCENE, small))
+    frame, link = setup.frame(3), ("AT", "AT")
+    assert prepare(load(SCENE, [*small, "emitters={}"])).frame(3).foreign == {}
     alone = replace(frame, foreign={}).samples(link).samples
     extra = frame.samples(link).samples - alone
     truth = np.zeros(alone.shape, complex)
     ear = ReceiveArray(frame.poses["AT"], setup.antennas)
     for arrival in frame.foreign["AT"]:
-        add_foreign(truth, setup.waveform, arrival, ear, Reference(setup.timetable.start_time(4)))
+        add_foreign(truth, setup.waveform, arrival, ear, Reference(setup.timetable.start_time(3)))
     noise = frame.noise_power(link)
     assert np.mean(np.abs(extra - truth) ** 2) < 0.02 * noise
     assert np.mean(np.abs(truth) ** 2) > 0.2 * noise
@@ -137,6 +138,7 @@ TWO = {
             "velocity_mps": [1, -9, 0],
             "boresight": [0, -1, 0],
             "clock_offset_s": 4e-6,
+            "clock_drift_ppm": -30.0,
             "radio": {
                 "chirps_per_frame": 64,
                 "scheme": "ddm",
@@ -157,14 +159,14 @@ TWO = {
 def test_radars_of_two_chirps_disturb_each_other():
     """Numbers of the data sheet, by hand: B in the samples of A and A in those of B, and neither
     where its carrier is elsewhere. Planted bug: the power of one antenna of three; the clock of B
-    ignored where it sends, or where it receives; bands taken to overlap anywhere."""
+    ignored where it sends, or where it receives; bands taken to overlap anywhere; the drift of B
+    taken for A's."""
     setup = prepare(load(TWO))
     frame, at_a, at_b = setup.frame(3), ("A", "A"), ("B", "B")
-    power = 10 ** ((12 - 30) / 20)
-    trains = {
-        "A": (Train(77e9, 18e12, 34e-6, 40e-6, 4e-6, 64, 0.02), power * np.sqrt(3)),
-        "B": (Train(77e9, 15e12, 33e-6, 40e-6, -4e-6, 192, 0.02), power),
-    }
+    power, d = 10 ** ((12 - 30) / 20), 1 - 30e-6  # what B's clock takes for a second
+    chirps_of_b = Train(77e9 / d, 18e12 / d**2, 34e-6 * d, 40e-6 * d, 4e-6 * d, 64, 0.02 * d)
+    chirps_of_a = Train(77e9 * d, 15e12 * d**2, 33e-6 / d, 40e-6 / d, -4e-6 / d, 192, 0.02 / d)
+    trains = {"A": (chirps_of_b, power * np.sqrt(3)), "B": (chirps_of_a, power)}
     for link, other in ((at_a, "B"), (at_b, "A")):
         part = setup.of(link[0])
         of_part = part.frame(3)
@@ -217,7 +219,7 @@ def test_radars_of_chirps_shorter_than_any_that_is_stated_disturb_each_other():
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "message"),
     [
         (["emitters.car.slope=1"], "emitters.car.slope"),
         (["emitters.gate.burst_interval_s=0.001"], "shorter than a burst, which lasts 0.004864 s"),
@@ -233,6 +235,6 @@ def test_radars_of_chirps_shorter_than_any_that_is_stated_disturb_each_other():
         (["emitters.AT={position_m: [0,0,1], boresight: [0,1,0], start_hz: 77e9}"], "emitters.AT"),
     ],
 )
-def test_emitters_that_cannot_be_are_refused(more, said):
-    with pytest.raises(ScenarioError, match=said):
+def test_emitters_that_cannot_be_are_refused(more, message):
+    with pytest.raises(ScenarioError, match=message):
         prepare(load(SCENE, more))
