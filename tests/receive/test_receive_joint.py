@@ -205,13 +205,15 @@ def test_energy_of_a_path_in_the_residual(passes: int):
 
 
 def predicted(theta: np.ndarray, w: Waveform) -> Prediction:
+    """Return the truth, one stated deviation off in range and in velocity."""
     one = np.ones(1)
+    range_std, velocity_std = 0.1 * w.range_cell(1), 0.2 * w.velocity_cell(1)
     return Prediction(
-        range=(theta[0] + 0.1 * w.range_cell(1)) * one,
-        velocity=(theta[1] + 0.2 * w.velocity_cell(1)) * one,
+        range=(theta[0] + range_std) * one,
+        velocity=(theta[1] + velocity_std) * one,
         direction=theta[None, 2:4],
-        range_std=0.03 * one,
-        velocity_std=0.1 * one,
+        range_std=range_std * one,
+        velocity_std=velocity_std * one,
         weight=one,
     )
 
