@@ -87,7 +87,7 @@ def _simulated(frames: int) -> tuple[Results, dict[tuple[str, ...], FrameParts],
         for one in parts.values():
             one(frame, link, cube)
 
-    results = simulate.run(scenario, progress=None, setup=setup, snapshots=frames, observe=observe)
+    results = simulate.run(scenario, progress=None, setup=setup, snapshots=frames, keep=observe)
     spent = sum(sum(one.seconds) for one in parts.values())
     return results, parts, time.process_time() - begin - spent
 

@@ -56,7 +56,7 @@ def test_rows_of_data_sets():
     for end in ("read", "written"):
         said = str(rows[f"{end}: all with the IF samples"]["also"])
         size = float(said.split(", ")[-1].split()[0].replace(",", ""))
-        assert 3 * 15 * 120 * 1024 * 8 / 1e3 < size < 3 * 15 * 120 * 1024 * 8 / 1e3 + 600
+        assert 3 * 15 * 120 * 1024 * 8 / 1e3 < size < 3 * 15 * 120 * 1024 * 8 / 1e3 + 700
 
 
 def test_hermespy_is_left_out_where_it_is_not_installed(tmp_path, monkeypatch, capsys):
@@ -148,8 +148,9 @@ def test_hermespy_floors_its_delays():
 @pytest.mark.slow
 @pytest.mark.sionna
 def test_denser_clutter_is_nearer_the_densest():
-    """Errors fall with the stated one and stay within twice of it; scatterers grow. Planted bug:
-    the truth's merged scatterers of another link."""
+    """Errors fall with the stated one and stay within twice of it; scatterers grow. Planted bugs:
+    the truth of another link; scatterers under noise merged, which keep the error of range-Doppler
+    cells alone (0.46 dB at 0.2 dB)."""
     rows = endtoend.densities(True, 1.0)
     errors, sizes = ([row[key] for row in rows] for key in ("error", "size"))
     assert errors == sorted(errors, reverse=True) and sizes == sorted(sizes)
