@@ -43,7 +43,7 @@ class Job:
         section = 10 ** (uav.rcs.value_dbsm / 10)
         speed = float(np.linalg.norm(self.frame.poses["person"].velocity))
         self.walker = walker_of(HIP_M / 0.53, speed, section, 0.4)
-        self.amplitudes = self.walker.amplitudes(np.zeros(3), np.zeros(3))
+        self.amplitudes = self.walker.amplitudes(np.zeros(3), np.zeros(3), np.zeros(1))
         centres = [("person", self.walker)]
         self.moving = MovingCentres(s.swarm, s.reference.sections, s.waveform, s.arrays, centres)
 

@@ -334,8 +334,8 @@ OF_CASES = {
     ),
     "doppler edge of a rotor": Bug(
         "extensions/street/centres.py",
-        "rate = (there.rate + back.rate) / SPEED_OF_LIGHT",
-        "rate = 2 * there.rate / SPEED_OF_LIGHT",
+        '"delay_rate": there.rate + back.rate',
+        '"delay_rate": 2 * there.rate',
     ),
     "lines of a circling point": Bug(
         "extensions/street/centres.py",
@@ -344,8 +344,8 @@ OF_CASES = {
     ),
     "blade of points": Bug(
         "extensions/street/rotors.py",
-        "[0] + 1) // 2",
-        "[0] + 1) // 3",
+        "LEFT_OUT) + 1) // 2",
+        "LEFT_OUT) + 1) // 3",
     ),
     "cross section of a vehicle and an agv": Bug(
         "extensions/street/extent.py",

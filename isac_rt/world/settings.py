@@ -256,6 +256,10 @@ MOST_BLADES_M = 8.0
 """Length of all blades of a UAV together [m]; 1 m is 1,000 points in each slot, 0.2 GB a frame."""
 
 
+NEAREST_BLADE_M = 0.05
+"""Least distance of a terminal's blades from its arrays [m]: a few of the arrays' own size."""
+
+
 class Rotors(Node):
     """Rotors of a UAV, whose blades turn in the plane across its body's Z axis."""
 
@@ -275,7 +279,24 @@ class Rotors(Node):
     stand still."""
     blade_dbsm: Decibels | None = None
     """Cross-section of a blade at its flash, seen across its length [dBsm]. null, the default: that
-    of a plastic edge, blade_length_m^2/pi less 11.4 dB (docs/moving.md)."""
+    of a plastic edge, or along the normal of a plastic plate (docs/moving.md)."""
+    chord_m: Annotated[float, Field(gt=0, le=0.3)] | None = None
+    """Width of a blade as a flat plate [m], such as 0.015 of the default blades; it matters near
+    the blades' normals, above and below the rotors. null, the default: a thin wire."""
+    incidence_deg: Annotated[float, Field(ge=-45, le=45)] = 10.0
+    """Angle by which a flat blade's leading edge is above its trailing edge [degrees]. The default
+    is that of a propeller with a pitch of 4 inches at three quarters of 12 cm."""
+    height_m: Annotated[float, Field(ge=-2, le=2)] = 0.0
+    """Height of the rotors over the UAV's position, where its arrays are [m]. The default is 0."""
+
+    def applies(self, name: str) -> bool:
+        return name != "incidence_deg" or self.chord_m is not None
+
+    @property
+    def nearest(self) -> float:
+        """Distance of the blades from the middle of the UAV [m]."""
+        inner = max(self.arm_m - self.blade_length_m, 0.0) if self.number > 1 else 0.0
+        return math.hypot(inner, self.height_m)
 
     @property
     def tip_speed(self) -> float:
@@ -478,6 +499,16 @@ class Uav(Node):
                 "is for targets: a terminal would sit within it; give it to a target, or remove it"
             )
             yield Problem((("box",), ("role",)), text)
+        if (
+            self.rotors is not None
+            and self.role != "target"
+            and self.rotors.nearest < NEAREST_BLADE_M
+        ):
+            yield Problem(
+                (("rotors", "height_m"), ("rotors", "arm_m"), ("role",)),
+                f"the blades come to {self.rotors.nearest:.2g} m from the arrays of a terminal, at "
+                f"least {NEAREST_BLADE_M:g} m are needed; raise height_m or arm_m",
+            )
         for key in ("rotors", "extent"):
             if getattr(self, key) is not None and self.rcs.model == "relative":
                 text = "needs a cross-section in square metres; give the UAV another rcs.model"

@@ -21,28 +21,27 @@ before synthesis: what scores and draws paths sees the UAV's own, and stored pat
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from isac_rt.extensions.street.extent import fixed_of
-from isac_rt.extensions.street.motion import CentreModel, Motion
-from isac_rt.extensions.street.rotors import blades_of
+from isac_rt.extensions.street.motion import PHASE_ERROR, CentreModel, Motion
+from isac_rt.extensions.street.rotors import Blades, blades_of
 from isac_rt.extensions.street.walker import walker_of_flight
 from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
-from isac_rt.propagation.pathset import PathSet, make_paths, merge
+from isac_rt.propagation.free_space import radar_amplitude
+from isac_rt.propagation.pathset import PathKind, PathSet, make_paths, merge
 from isac_rt.propagation.rcs import CrossSection
 from isac_rt.world.swarm import Pose, Swarm, turned
 
 GRAVITY = np.array([0.0, 0.0, 9.81])  # what a hovering UAV's thrust bears [m/s^2]
 LEAST_THRUST = 0.1
 """Acceleration of thrust [m/s^2] below which the body's Z axis is left upright: it falls freely."""
-PHASE_ERROR = 1e-3
-"""Largest phase error [rad] at the ends of a piece; 0.06 % of its samples on average."""
 
 
 def moving_centres(
@@ -54,6 +53,7 @@ def moving_centres(
 ) -> MovingCentres:
     """Return the moving centres of all UAVs that have any."""
     models: list[tuple[str, CentreModel]] = []
+    own: dict[str, Blades] = {}
     for name, uav in swarm.uavs.items():
         if uav.extent is not None and uav.extent.kind == "pedestrian":
             models.append((name, walker_of_flight(uav.extent, swarm, seed, name)))
@@ -61,7 +61,9 @@ def moving_centres(
             models.append((name, fixed_of(uav.extent, seed, name)))
         if uav.rotors is not None:
             models.append((name, blades_of(uav.rotors, waveform, seed, name)))
-    return MovingCentres(swarm, sections, waveform, arrays, models)
+            wires = uav.rotors.model_copy(update={"chord_m": None})
+            own[name] = blades_of(wires, waveform, seed, name)
+    return MovingCentres(swarm, sections, waveform, arrays, models, own)
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,7 @@ class MovingCentres:
     swarm, waveform, arrays : of the run
     sections : cross-section of each UAV's own echo
     models : of centres, with the name of the UAV each
+    own : blades of each UAV as its own radar receives them, wires
     """
 
     swarm: Swarm
@@ -80,6 +83,7 @@ class MovingCentres:
     waveform: Waveform
     arrays: Arrays
     models: Sequence[tuple[str, CentreModel]]
+    own: Mapping[str, Blades] = field(default_factory=dict)
 
     def with_centres(
         self,
@@ -99,16 +103,20 @@ class MovingCentres:
         target = np.array([*paths.target_names, ""])[paths.target]
         gives_way = [name for name, model in self.models if model.replaces_echo]
         parts = [paths.select(~np.isin(target, gives_way))]
+        later = middle - paths.epoch
         for name, model in self.models:
-            attitude = self._attitude(name, paths.epoch)
-            bases = self._bases(paths, target == name, poses, (name, model, attitude))
+            of = name, model, self._attitude(name, paths.epoch)
             least = 0.0 if model.replaces_echo else least_power
-            bases = [base for base in bases if base.power > least]
+            bases = [b for b in self._bases(paths, target == name, poses, of) if b.power > least]
             if bases:
-                slots = self._slots_of_piece(paths, poses, (name, model, attitude))
-                begin, time = self.pieces(slots, middle - paths.epoch)
-                offset = attitude.turned(model.motion(paths.epoch + time), time)
-                parts += [_copies(base, offset, begin, time) for base in bases]
+                begin, time = self.pieces(self._slots_of_piece(paths, poses, of), later)
+                offset = of[2].turned(model.motion(paths.epoch + time), time)
+                for base in bases:
+                    amplitudes = model.amplitudes(*base.towards, paths.epoch + time)
+                    parts.append(_copies(base, amplitudes, offset, begin, time))
+        own = self.own_echoes(paths, poses, later)
+        if own is not None and (own.power.sum() > least_power * self.waveform.num_chirps):
+            parts.append(own)
         return merge(parts) if len(parts) > 1 else paths
 
     def _bases(
@@ -123,12 +131,53 @@ class MovingCentres:
         for row in np.flatnonzero(which):
             path = paths.select(np.array([row]))
             images = end_images(path, poses, name)
-            towards = [poses[name].to_body(image.towards) for image in images]
-            section = self.sections[name].square_metres(*towards)
-            by_axes = (image.towards @ attitude.axes for image in images)
-            gain = model.amplitudes(*by_axes) * (path.gain / np.sqrt(section))
-            out.append(Base(path, *images, gain))
+            section = self.sections[name].square_metres(
+                *(poses[name].to_body(image.towards) for image in images)
+            )
+            towards = images[0].towards @ attitude.axes, images[1].towards @ attitude.axes
+            gain = path.gain / np.sqrt(section)
+            power = float(np.abs(gain[0]) ** 2 * model.mean_section(*towards))
+            out.append(Base(path, *images, towards, gain, power))
         return out
+
+    def own_echoes(self, paths: PathSet, poses: Mapping[str, Pose], later: float) -> PathSet | None:
+        """Return the echoes of a radar's own blades, slot by slot, the middle of the frame `later`
+        [s] than the epoch; None without.
+
+        Each point of a blade at r from the arrays has the delay 2 r/c, the spherical wavefronts of
+        r, and the amplitude of the radar equation: the points are a fraction of a wavelength long.
+        """
+        if not paths.link.own or paths.tx not in self.own:
+            return None
+        name, model = paths.tx, self.own[paths.tx]
+        begin, time = self.pieces(1 if model.speed else self.waveform.num_chirps, later)
+        axes = body_axes(self.swarm, name, paths.epoch)
+        motion = Motion(*(m @ axes.T for m in model.motion(paths.epoch + time)))
+        distance, rate, accel = _distance(motion)
+        towards = motion.place / distance[..., None]
+        section, wavelength = model.amplitude**2, self.waveform.wavelength
+        columns = {
+            "gain": radar_amplitude(wavelength, section, distance, distance)
+            * self.arrays.of(name).element_gain(poses[name].to_body(towards)),
+            "delay": 2 * distance,
+            "delay_rate": 2 * rate,
+            "delay_accel": 2 * accel,
+            **dict.fromkeys(("departure", "arrival"), towards),
+            **dict.fromkeys(("tx_radius", "rx_radius"), distance),
+        }
+        at_arrays = make_paths(
+            tx=name,
+            rx=name,
+            epoch=paths.epoch,
+            target_names=paths.target_names,
+            kind=PathKind.LEAKAGE,
+            gain=[1.0],
+            delay=[0.0],
+            departure=[axes[1]],
+            arrival=[axes[1]],
+        )
+        received = columns["gain"].any(axis=0)
+        return _pieces(at_arrays, columns, begin, time).select(np.tile(received, time.size))
 
     def report(
         self,
@@ -143,28 +192,55 @@ class MovingCentres:
         over_noise : by link, the mean power of a cell over the noise for a mean |gain|^2 of one
         """
         w, out = self.waveform, []
-        widest = 1 / (2 * w.slot_duration)
         slot = w.chirp_duration + (w.num_groups - 1) * w.group_spacing - w.window_start
+        frequency = w.carrier_frequency + w.bandwidth
         for name, model in self.models:
-            edge, level = 2 * model.speed / w.wavelength, -np.inf
+            level, parts = -np.inf, model.described()
             for link, paths in found.items():
                 which = np.array([*paths.target_names, ""])[paths.target] == name
                 of = name, model, self._attitude(name, paths.epoch)
                 for base in self._bases(paths, which, poses, of):
-                    level = max(level, 10 * np.log10(base.power * over_noise[link]))
-            frequency = w.carrier_frequency + w.bandwidth
+                    power = base.power * over_noise[link]
+                    if 10 * np.log10(power) > level:
+                        level, parts = 10 * np.log10(power), model.described(*base.towards)
             error = 2 * np.pi * frequency * remainder(model.jerk, slot / 2)
-            out.append(
-                {
-                    "what": f"moving parts of {name}",
-                    "modelled": f"{model.described()}, {level:.0f} dB over the noise of a cell; "
-                    f"Doppler to {edge:.4g} Hz either side, slots show {widest:.4g} Hz",
-                    "left_out": "jerk and turning within pieces of the frame",
-                    "estimate": max(PHASE_ERROR, error),
-                    "unit": "rad",
-                }
-            )
+            left_out = "jerk and turning within pieces of the frame"
+            row = self._row(parts, model.speed, level, left_out, max(PHASE_ERROR, error))
+            out.append({"what": f"moving parts of {name}", **row})
+        for link, paths in found.items():
+            own = self.own_echoes(paths, poses, 0.0)
+            if own is not None:
+                blades, gain = self.own[link.tx], own.gain.real.reshape(w.num_chirps, -1)
+                level = 10 * np.log10(own.power.sum() / w.num_chirps * over_noise[link])
+                antennas = self.arrays.of(link.tx)
+                ends = antennas.rx_positions, antennas.tx_positions
+                reach = sum(float(np.linalg.norm(end, axis=1).max()) for end in ends)
+                turn = blades.speed / own.rx_radius.min() * slot / 2
+                error = 2 * np.pi * frequency / SPEED_OF_LIGHT * reach * turn
+                # the other change of a slot is in gain: by spreading and the elements' pattern
+                error += np.linalg.norm(np.diff(gain, axis=0)) / np.linalg.norm(gain) / 2
+                left_out = "directions and ranges within a slot"
+                row = self._row(blades.described(), blades.speed, level, left_out, float(error))
+                out.append({"what": f"own rotors of {link.tx}", **row})
         return out
+
+    def _row(
+        self, parts: str, speed: float, level: float, left_out: str, error: float
+    ) -> dict[str, Any]:
+        """Return what the plan says of moving parts, by their speed [m/s], their level over the
+        noise [dB] and the error of what is left out [rad]."""
+        edge, widest = 2 * speed / self.waveform.wavelength, 1 / (2 * self.waveform.slot_duration)
+        seen = (
+            f"{level:.0f} dB over the noise of a cell; Doppler to {edge:.4g} Hz either side, slots "
+            f"show {widest:.4g} Hz"
+        )
+        seen = seen if np.isfinite(level) else "without effect: no terminal receives its echo"
+        return {
+            "modelled": f"{parts}, {seen}",
+            "left_out": left_out,
+            "estimate": error,
+            "unit": "rad",
+        }
 
     def pieces(self, slots: int, later: float) -> tuple[np.ndarray, np.ndarray]:
         """Return when pieces of so many slots begin and the last ends (T + 1,), and their middles
@@ -278,41 +354,57 @@ class EndImage(NamedTuple):
 
 
 class Base(NamedTuple):
-    """A path of a UAV, its ends as the UAV sees them, and the gains (K,) of centres there."""
+    """A path of a UAV and its ends as the UAV sees them.
+
+    Attributes
+    ----------
+    towards : (3,) unit vectors to both ends in the axes of the body
+    gain : (1,) of a centre of one square metre in place of the UAV
+    power : |gain|^2 of all centres together
+    """
 
     path: PathSet
     sent: EndImage
     received: EndImage
+    towards: tuple[np.ndarray, np.ndarray]
     gain: np.ndarray
-
-    @property
-    def power(self) -> float:
-        """|gain|^2 of all centres: their mean power within 3 dB."""
-        return float((np.abs(self.gain) ** 2).sum())
+    power: float
 
 
-def _copies(base: Base, offset: Motion, begin: np.ndarray, time: np.ndarray) -> PathSet:
-    """Return the copies of one path to centres that move by `offset` about the UAV, in pieces from
-    `begin` (T + 1,) about `time` (T,) [s since the epoch]."""
+def _copies(
+    base: Base, amplitudes: np.ndarray, offset: Motion, begin: np.ndarray, time: np.ndarray
+) -> PathSet:
+    """Return the copies of one path to centres of amplitudes (K,) or (T, K) [m] that move by
+    `offset` about the UAV, in pieces from `begin` (T + 1,) about `time` (T,) [s since the epoch].
+    """
     path = base.path
     there = segment(base.sent, time, offset)
     back = there if base.received is base.sent else segment(base.received, time, offset)
-    rate = (there.rate + back.rate) / SPEED_OF_LIGHT
-    accel = (there.accel + back.accel) / SPEED_OF_LIGHT
-    t = time[:, None]
-    longer = (there.longer + back.longer) / SPEED_OF_LIGHT
     columns = {
-        "gain": base.gain * there.spreading * back.spreading,
-        "delay": path.delay + longer - (rate - accel * t / 2) * t,
-        "delay_rate": path.delay_rate + rate - accel * t,
-        "delay_accel": path.delay_accel + accel,
+        "gain": base.gain * amplitudes * there.spreading * back.spreading,
+        "delay": there.longer + back.longer,
+        "delay_rate": there.rate + back.rate,
+        "delay_accel": there.accel + back.accel,
         "departure": _unit(path.departure + there.turn @ base.sent.mirror.T),
         "arrival": _unit(path.arrival + back.turn @ base.received.mirror.T),
         "tx_radius": np.where(np.isinf(path.tx_radius), np.inf, there.length),
         "rx_radius": np.where(np.isinf(path.rx_radius), np.inf, back.length),
-        "begin": np.broadcast_to(np.maximum(begin[:-1, None], path.begin), rate.shape),
-        "end": np.broadcast_to(np.minimum(begin[1:, None], path.end), rate.shape),
     }
+    return _pieces(path, columns, begin, time)
+
+
+def _pieces(
+    path: PathSet, columns: dict[str, np.ndarray], begin: np.ndarray, time: np.ndarray
+) -> PathSet:
+    """Return paths that differ from one in columns (T, K), in pieces of the frame: `delay` [m] and
+    its derivatives in the pieces' middles, as additions to those of the path."""
+    rate, accel, t = columns["delay_rate"], columns["delay_accel"], time[:, None]
+    columns["delay"] = columns["delay"] - (rate - accel * t / 2) * t
+    columns["delay_rate"] = rate - accel * t
+    for name in ("delay", "delay_rate", "delay_accel"):
+        columns[name] = getattr(path, name) + columns[name] / SPEED_OF_LIGHT
+    columns["begin"] = np.broadcast_to(np.maximum(begin[:-1, None], path.begin), rate.shape)
+    columns["end"] = np.broadcast_to(np.minimum(begin[1:, None], path.end), rate.shape)
     flat: dict[str, Any] = {k: v.reshape(-1, *v.shape[2:]) for k, v in columns.items()}
     same: dict[str, Any] = {k: getattr(path, k)[0] for k in ("kind", "target", "bounces")}
     (tx, rx), names = path.link, path.target_names

@@ -81,13 +81,19 @@ class Fixed:
     speed: ClassVar[float] = 0.0
     jerk: ClassVar[float] = 0.0
 
-    def described(self) -> str:
+    def described(self, *towards: np.ndarray) -> str:
         """Return the centres in words."""
         return f"{len(self.places)} scattering centres"
 
-    def amplitudes(self, incident: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    def amplitudes(
+        self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
+    ) -> np.ndarray:
         """(K,) square root of each centre's cross-section [m]."""
         return np.sqrt([section(incident, observed) for section in self.sections])
+
+    def mean_section(self, incident: np.ndarray, observed: np.ndarray) -> float:
+        """Return the cross-section of all centres, added by power [m^2]."""
+        return sum(section(incident, observed) for section in self.sections)
 
     def motion(self, time: np.ndarray) -> Motion:
         """Return the centres' places, at rest."""

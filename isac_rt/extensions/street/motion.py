@@ -6,6 +6,9 @@ from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
+PHASE_ERROR = 1e-3
+"""Largest phase error [rad] at the ends of a piece; 0.06 % of its samples on average."""
+
 
 class Motion(NamedTuple):
     """Places, velocities and accelerations, (T, K, 3) each [m, m/s, m/s^2]."""
@@ -32,13 +35,19 @@ class CentreModel(Protocol):
     @property
     def jerk(self) -> float: ...
 
-    def described(self) -> str:
-        """Return what is modelled, in words for the plan."""
+    def described(self, *towards: np.ndarray) -> str:
+        """Return what is modelled, in words for the plan, as seen from directions (3,)."""
         ...
 
-    def amplitudes(self, incident: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    def amplitudes(
+        self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
+    ) -> np.ndarray:
         """(K,) square root of each centre's cross-section [m] towards source and observer, unit
-        vectors (3,) in the body's axes."""
+        vectors (3,) in the body's axes; (T, K) where it changes with time (T,) [s]."""
+        ...
+
+    def mean_section(self, incident: np.ndarray, observed: np.ndarray) -> float:
+        """Return the cross-section of all centres, added by power and over time [m^2]."""
         ...
 
     def motion(self, time: np.ndarray) -> Motion:

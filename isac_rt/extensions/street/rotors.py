@@ -1,8 +1,9 @@
-r"""Blades of rotors as scattering centres: a thin wire as a sum of points that equals its integral.
+r"""Blades of rotors as scattering centres: sums of points that equal the integral over the blade.
 
-A blade is a wire of uniform cross-section per length from the hub to the tip. Its amplitude
-towards bistatic directions with the sum :math:`s = u_1 + u_2`, for a wave number k and the blade's
-direction e, is the closed form (V. C. Chen, The Micro-Doppler Effect in Radar, chapter 3)
+A blade is a thin wire or, with a chord, a flat plate. The wire is of uniform cross-section per
+length from the hub to the tip. Its amplitude towards bistatic directions with the sum
+:math:`s = u_1 + u_2`, for a wave number k and the blade's direction e, is the closed form
+(V. C. Chen, The Micro-Doppler Effect in Radar, chapter 3)
 
 .. math:: \frac{\sqrt\sigma}{L}\int_0^L e^{jk r\,s\cdot e}dr = \sqrt\sigma\,\mathrm{sinc}(x/\pi)\,
    e^{jx}, \qquad x = \tfrac12 k L\,s\cdot e
@@ -16,23 +17,39 @@ degrees below 2N exactly and the Legendre coefficients of :math:`e^{jax}` are
 A metal edge seen across its length L has :math:`\sigma = L^2/\pi` (E. F. Knott, Radar Cross
 Section, 2nd edition, section 6.3, the field along the edge); plastic with a permittivity of 3
 reflects 11.4 dB less (Fresnel).
+
+A flat plate of chord W along w, with the normal n, has the amplitude of physical optics
+
+.. math:: \frac{\sqrt{4\pi}LW}{\lambda}\,\frac{|n\cdot u_1|+|n\cdot u_2|}{2}\,
+   \mathrm{sinc}(x/\pi)\,e^{jx}\,\mathrm{sinc}(y/\pi), \qquad y = \tfrac12 k W\,s\cdot w
+
+The obliquity is the mean of :math:`|n\cdot u_1|` of a field across the plane of incidence and of
+:math:`|n\cdot u_2|` of one in it; from one place both are the same (Knott, section 5.2; Chen,
+section 3.3). The chord has a few points with exact delays. Near the direction in the middle of a
+piece their amplitudes give the integral over the chord: its phase is interpolated between them
+(Lagrange's polynomials at Gauss's nodes).
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from scipy.special import spherical_jn
 
-from isac_rt.extensions.street.motion import Motion
+from isac_rt.extensions.street.motion import PHASE_ERROR, Motion
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.randomness import generator
 from isac_rt.world.settings import Rotors
 
 LEFT_OUT = 1e-5
 """Amplitude that the sum of points may miss of a flash."""
+CHORD_LEFT_OUT = 1e-3
+"""Amplitude that the points of a chord may miss, a tenth of what pieces miss of the obliquity."""
+ANGLES = 8
+"""Angles of a blade in each lobe of its pattern at which mean powers are summed."""
 PLASTIC = ((np.sqrt(3.0) - 1) / (np.sqrt(3.0) + 1)) ** 2
 """Power that a plastic surface with a permittivity of 3 reflects."""
 
@@ -68,15 +85,21 @@ class Blades:
         """Largest jerk of a point [m/s^3]."""
         return float(np.abs(self.radius * self.turning**3).max())
 
-    def described(self) -> str:
+    def described(self, *towards: np.ndarray) -> str:
         """Return the blades in words."""
         each = int((self.hub == self.hub[0]).all(axis=1).sum())
         ends = np.isclose(self.radius, self.radius.max()).sum()
         return f"{self.radius.size // each} rotors, {ends} blades as {self.radius.size} points"
 
-    def amplitudes(self, incident: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    def amplitudes(
+        self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
+    ) -> np.ndarray:
         """(K,) square root of each point's cross-section [m]."""
         return self.amplitude
+
+    def mean_section(self, incident: np.ndarray, observed: np.ndarray) -> float:
+        """Return the cross-section of all points, added by power [m^2]."""
+        return float((self.amplitude**2).sum())
 
     def motion(self, time: np.ndarray) -> Motion:
         """Return the points' motion in the body's axes at times (T,) [s]."""
@@ -88,33 +111,143 @@ class Blades:
         return Motion(self.hub + arm, speed, -(self.turning[:, None] ** 2) * arm)
 
 
+@dataclass(frozen=True)
+class Plates(Blades):
+    """Points on flat blades: several along each blade for each of its chord.
+
+    Attributes
+    ----------
+    rotors : size and incidence of the blades
+    wave_number : in the middle of the band [rad/m]
+    nodes : (M,) places on the chord over half its length
+    start, spin, lead : (N,) of each blade: angle at time 0 [rad], angular velocity [rad/s], and
+        which way its leading edge points, 1: to the right of a blade that points ahead
+    """
+
+    rotors: Rotors
+    wave_number: float
+    nodes: np.ndarray
+    start: np.ndarray
+    spin: np.ndarray
+    lead: np.ndarray
+
+    def described(self, *towards: np.ndarray) -> str:
+        """Return the blades in words."""
+        r, blades = self.rotors, self.start.size
+        out = f"{r.number} rotors, {blades} flat blades as {self.radius.size} points"
+        if not towards:
+            return out
+        wires = r.model_copy(update={"chord_m": None, "blade_dbsm": None})
+        lobes = self.wave_number * r.blade_length_m / np.pi
+        edges = blades * blade_section(wires) / (2 * lobes)  # mean of a sinc squared over a turn
+        ratio = 10 * np.log10(self.mean_section(*towards) / edges)
+        return f"{out}, {ratio:+.0f} dB against their edges as wires"
+
+    def amplitudes(
+        self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
+    ) -> np.ndarray:
+        """(T, K) square root of each point's cross-section at times (T,) [s], with its phase."""
+        angle = self.start + self.spin * time[:, None]
+        obliquity, _, y = self._aspect(angle, incident, observed)
+        place, weight = np.polynomial.legendre.leggauss(num_points(float(np.abs(y).max())))
+        share = weight / 2 * lagrange(self.nodes, place)
+        chord = np.exp(1j * y[..., None] * place) @ share.T
+        chord *= obliquity[..., None] * np.exp(-1j * y[..., None] * self.nodes)
+        along = self.radius.size // (self.start.size * self.nodes.size)
+        return np.asarray(self.amplitude * chord.reshape(time.size, -1).repeat(along, axis=1))
+
+    def mean_section(self, incident: np.ndarray, observed: np.ndarray) -> float:
+        """Return the mean cross-section of all blades over a turn [m^2]."""
+        lobes = int(4 * self.wave_number * self.rotors.blade_length_m / np.pi) + 1
+        angle = np.linspace(0, 2 * np.pi, ANGLES * lobes, endpoint=False)
+        obliquity, x, y = self._aspect(angle[:, None] + 0 * self.lead, incident, observed)
+        pattern = (obliquity * np.sinc(x / np.pi) * np.sinc(y / np.pi)) ** 2
+        return float(blade_section(self.rotors, self.wave_number) * pattern.mean(axis=0).sum())
+
+    def _aspect(
+        self, angle: np.ndarray, incident: np.ndarray, observed: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return obliquity, x and y of blades at angles (..., N)."""
+        sine, cosine, r = np.sin(angle), np.cos(angle), self.rotors
+        flat, tilt = np.zeros_like(angle), np.radians(r.incidence_deg)
+        blade = np.stack([sine, cosine, flat], axis=-1)
+        ahead = np.stack([self.lead * cosine, -self.lead * sine, flat], axis=-1)
+        chord = np.cos(tilt) * ahead + np.sin(tilt) * np.array([0.0, 0.0, 1.0])
+        normal, both = np.cross(blade, chord), incident + observed
+        obliquity = (np.abs(normal @ incident) + np.abs(normal @ observed)) / 2
+        x, y = blade @ both * r.blade_length_m, chord @ both * (r.chord_m or 0.0)
+        return obliquity, self.wave_number / 2 * x, self.wave_number / 2 * y
+
+
 def blades_of(rotors: Rotors, waveform: Waveform, seed: int, name: str) -> Blades:
     """Return the points of a UAV's rotors, with phases at time 0 drawn by the UAV's name."""
-    r = rotors
-    highest = waveform.carrier_frequency + waveform.bandwidth
-    length, weight = blade_points(r.blade_length_m, 2 * np.pi * highest / SPEED_OF_LIGHT)
+    r, w = rotors, waveform
+    highest = 2 * np.pi * (w.carrier_frequency + w.bandwidth) / SPEED_OF_LIGHT
+    middle = 2 * np.pi * (w.carrier_frequency + w.bandwidth / 2) / SPEED_OF_LIGHT
+    length, weight = blade_points(r.blade_length_m, highest)
+    nodes, tilt = chord_nodes(r, w), np.radians(r.incidence_deg)
     rotor = np.arange(r.number)
     where = (rotor + 0.5) * 2 * np.pi / r.number
     arm = r.arm_m if r.number > 1 else 0.0
     hub = arm * np.stack([np.sin(where), np.cos(where), np.zeros(r.number)], axis=1)
-    start = generator(seed, "rotors", name).uniform(0, 2 * np.pi, r.number)
-    phase = start[:, None] + np.arange(r.blades) * 2 * np.pi / r.blades
-    turning = (-1.0) ** rotor * 2 * np.pi * r.rev_per_min / 60
-    shape = (r.number, r.blades, length.size)
-    return Blades(
-        np.broadcast_to(hub[:, None, None], (*shape, 3)).reshape(-1, 3),
-        np.broadcast_to(length, shape).ravel(),
-        np.broadcast_to(phase[:, :, None], shape).ravel(),
-        np.broadcast_to(turning[:, None, None], shape).ravel(),
-        np.broadcast_to(np.sqrt(blade_section(r)) * weight, shape).ravel(),
+    begin = generator(seed, "rotors", name).uniform(0, 2 * np.pi, r.number)
+    start = begin[:, None] + np.arange(r.blades) * 2 * np.pi / r.blades
+    lead = (-1.0) ** rotor
+    spin = lead * 2 * np.pi * r.rev_per_min / 60
+    shape = (r.number, r.blades, nodes.size, length.size)
+    off = (r.chord_m or 0.0) / 2 * nodes[:, None]
+    side = lead[:, None, None, None] * np.cos(tilt) * off  # ahead of the blade's axis
+    place = np.broadcast_to(hub[:, None, None, None], (*shape, 3)).copy()
+    place[..., 2] += r.height_m + np.sin(tilt) * off
+    section = blade_section(r, middle)
+    numbers = (
+        place.reshape(-1, 3),
+        np.broadcast_to(np.hypot(length, side), shape).ravel(),
+        (start[..., None, None] + np.arctan2(side, length)).ravel(),
+        np.broadcast_to(spin[:, None, None, None], shape).ravel(),
+        np.broadcast_to(np.sqrt(section) * weight, shape).ravel(),
     )
+    if r.chord_m is None:
+        return Blades(*numbers)
+    of_blades = (np.broadcast_to(v[:, None], start.shape).ravel() for v in (spin, lead))
+    return Plates(*numbers, r, middle, nodes, start.ravel(), *of_blades)
 
 
-def blade_section(rotors: Rotors) -> float:
-    """Return the cross-section of a blade at its flash [m^2]."""
-    if rotors.blade_dbsm is not None:
-        return 10 ** (rotors.blade_dbsm / 10)
-    return float(PLASTIC * rotors.blade_length_m**2 / np.pi)
+def chord_nodes(rotors: Rotors, waveform: Waveform) -> np.ndarray:
+    """Return the points of a chord, as parts of half its length; of a wire the one in its middle.
+
+    Between the points the phase differs from that in the middle of a piece by the blade's turn
+    within it (two thirds of `PHASE_ERROR` along the blade, or half a slot), and over the band.
+    """
+    r, w = rotors, waveform
+    if r.chord_m is None:
+        return np.zeros(1)
+    k = 2 * np.pi * (w.carrier_frequency + w.bandwidth) / SPEED_OF_LIGHT
+    turn = max(
+        np.pi * r.rev_per_min / 60 * w.slot_duration,
+        (3 * PHASE_ERROR / (k * r.blade_length_m)) ** (1 / 3),
+    )
+    beyond = k * r.chord_m * (turn + w.bandwidth / (2 * w.carrier_frequency))
+    return np.asarray(np.polynomial.legendre.leggauss(degree(beyond, CHORD_LEFT_OUT))[0])
+
+
+def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return Lagrange's polynomials of nodes (M,) at places (Q,): (M, Q)."""
+    out = np.ones((nodes.size, at.size))
+    for m, n in itertools.permutations(range(nodes.size), 2):
+        out[m] *= (at - nodes[n]) / (nodes[m] - nodes[n])
+    return out
+
+
+def blade_section(rotors: Rotors, wave_number: float = 0.0) -> float:
+    """Return the cross-section of a blade at its flash, of a flat one along its normal, at a wave
+    number [rad/m] [m^2]."""
+    r = rotors
+    if r.blade_dbsm is not None:
+        return 10 ** (r.blade_dbsm / 10)
+    if r.chord_m is None:
+        return float(PLASTIC * r.blade_length_m**2 / np.pi)
+    return float(PLASTIC * (wave_number * r.blade_length_m * r.chord_m) ** 2 / np.pi)
 
 
 def blade_points(length: float, wave_number: float) -> tuple[np.ndarray, np.ndarray]:
@@ -128,7 +261,13 @@ def blade_points(length: float, wave_number: float) -> tuple[np.ndarray, np.ndar
 def num_points(argument: float) -> int:
     """Return the number of Gauss-Legendre points whose error bound is `LEFT_OUT` for
     exp(j a x), |a| up to `argument`."""
+    return (degree(argument, LEFT_OUT) + 1) // 2
+
+
+def degree(argument: float, left_out: float) -> int:
+    """Return from which degree on the Legendre coefficients of exp(j a x), |a| up to `argument`,
+    add up to `left_out` at most."""
     orders = np.arange(int(1.1 * argument) + 60)
     terms = (2 * orders + 1) * np.abs(spherical_jn(orders, argument))
     beyond = np.cumsum(terms[::-1])[::-1]  # from each order on
-    return int(np.flatnonzero(beyond <= LEFT_OUT)[0] + 1) // 2
+    return int(np.flatnonzero(beyond <= left_out)[0])

@@ -67,13 +67,19 @@ class Walker:
         term."""
         return 2 * self.speed * self.rate**2
 
-    def described(self) -> str:
+    def described(self, *towards: np.ndarray) -> str:
         """Return the limbs in words."""
         return f"trunk and four limbs as {self.length.size} points"
 
-    def amplitudes(self, incident: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    def amplitudes(
+        self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
+    ) -> np.ndarray:
         """(K,) square root of each point's cross-section [m]."""
         return np.full(self.length.size, np.sqrt(self.section / self.length.size))
+
+    def mean_section(self, incident: np.ndarray, observed: np.ndarray) -> float:
+        """Return the cross-section of all centres, added by power [m^2]."""
+        return self.section
 
     def motion(self, time: np.ndarray) -> Motion:
         """Return the points' motion in the body's axes at times (T,) [s]."""

@@ -6,23 +6,35 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.special import jv
+from street_scene import (
+    OVER_GROUND,
+    OWN,
+    echo_amplitude,
+    error_of,
+    over_ground,
+    samples_of,
+    scene,
+    sum_over_points,
+)
 from truths.moving import echo_over
 
 import isac_rt as irt
 from isac_rt.extensions.street import centres
 from isac_rt.extensions.street.centres import MovingCentres, remainder
-from isac_rt.extensions.street.rotors import Blades, blade_points, blade_section, blades_of
+from isac_rt.extensions.street.rotors import (
+    PLASTIC,
+    Blades,
+    blade_points,
+    blade_section,
+    blades_of,
+)
 from isac_rt.frame.antennas import Antennas, Arrays
-from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.pathset import PathKind, make_paths
 from isac_rt.results.provenance import path_content
-from isac_rt.scenario.tree import Scenario
-from isac_rt.signal.exact import filter_gain
 from isac_rt.world.settings import Rotors, Uav
 from isac_rt.world.swarm import Pose, Swarm
 
-OWN = Link("radar", "radar")
 POINT = Arrays(Antennas(tx_x=1, tx_z=1, rx_x=1, rx_z=1, spacing=0.0))
 
 
@@ -35,24 +47,7 @@ class Isotropic:
 
 def scenario(chirps=24, **uav):
     flight = {"position_m": [1.0, 6.0, 1.5], "velocity_mps": [3.0, -4.0, 1.0]}
-    return Scenario.model_validate(
-        {
-            "frames": 2,
-            "sensor": "awr1843",
-            "radio": {"chirps_per_frame": chirps},
-            "receiver_preset": "plain",
-            "accuracy": {"preset": "everything"},
-            "swarm": {
-                "radar": {"role": "active", "position_m": [0, 0, 1], "boresight": [0, 1, 0.1]},
-                "Q": {
-                    "role": "target",
-                    "rcs": {"model": "constant", "value_dbsm": -10},
-                    **flight,
-                    **uav,
-                },
-            },
-        }
-    )
+    return scene({"rcs": {"model": "constant", "value_dbsm": -10}} | flight | uav, chirps)
 
 
 def circling(turning, radius, hub=(0.0, 0.0, 0.0), phase=0.3):
@@ -88,45 +83,25 @@ def at_times(pieces, times):
     return {"gain": pieces.gain[row], "delay": delay, "rate": rate + accel * t, "row": row}
 
 
-def synthesised(setup, frame, method):
-    """Samples without noise, of the body and with a set-up of rotors of its blades."""
-    links, ears = frame._arriving(OWN), frame._listening(OWN)
-    return irt.if_signal(setup.waveform, links, *ears, method).samples
-
-
-def sum_of_points(setup, frame):
-    """Samples of the circling points alone, from positions of elements and points at every
-    sample."""
-    w, uav = setup.waveform, setup.scenario.swarm["Q"]
-    rotors, antennas = uav.rotors, setup.arrays.of("radar")
-    body = blades_of(rotors, w, setup.scenario.seed, "Q")
-    pose = frame.poses["radar"]
-    tx = pose.position + pose.to_world(antennas.tx_positions)
-    rx = pose.position + pose.to_world(antennas.rx_positions)
-    q = frame.poses["Q"]
-    forward = np.array([q.velocity[0], q.velocity[1], 0.0])
-    forward /= np.linalg.norm(forward)
+def of_rotors(scenario, frame, mirrors=((1, 1, 1),), loss=1.0):
+    """Samples of the points of T's blades alone, by their places at every sample."""
+    setup, q = irt.prepare(scenario), frame.poses["T"]
+    body = blades_of(scenario.swarm["T"].rotors, setup.waveform, scenario.seed, "T")
+    forward = np.array([q.velocity[0], q.velocity[1], 0.0]) / np.hypot(*q.velocity[:2])
     right = np.array([forward[1], -forward[0], 0.0])
-    schedule = frame.sent["radar"].schedule
-    out = np.zeros((1, len(rx), w.num_chirps, w.num_samples), complex)
-    middle = setup.timetable.epoch(frame.number)
-    gain = frame.paths[OWN].gain[0] * np.sqrt(blade_section(rotors) / 0.1)
-    for p in range(w.num_chirps):
-        t = p * w.slot_duration + w.fast_time - w.frame_duration / 2
-        place = q.position + np.outer(t, q.velocity)
-        for k in range(body.radius.size):
-            angle = body.phase[k] + body.turning[k] * (t + middle)
-            arm = np.sin(angle)[:, None] * right + np.cos(angle)[:, None] * forward
-            hub = body.hub[k, 0] * right + body.hub[k, 1] * forward
-            point = place + hub + body.radius[k] * arm
-            there = np.linalg.norm(point - tx[schedule[0, p]], axis=1)
-            near = np.linalg.norm(place - pose.position, axis=1)
-            away = np.linalg.norm(point - pose.position, axis=1)
-            share = body.amplitude[k] / np.sqrt(blade_section(rotors)) * (near / away) ** 2
-            for r, ear in enumerate(rx):
-                tau = (there + np.linalg.norm(point - ear, axis=1)) / SPEED_OF_LIGHT
-                out[0, r, p] += gain.conj() * share * np.exp(2j * np.pi * w.phase(tau, w.fast_time))
-    return out * filter_gain(w, 0.0) * frame.sent["radar"].amplitude
+    epoch = setup.timetable.epoch(frame.number)
+
+    def places(t):
+        angle = body.phase + body.turning * t[:, None]
+        arm = np.sin(angle)[..., None] * right + np.cos(angle)[..., None] * forward
+        hub = body.hub[:, :1] * right + body.hub[:, 1:2] * forward
+        return uav(t)[:, None] + hub + body.radius[:, None] * arm
+
+    def uav(t):
+        return q.position + np.outer(t - epoch, q.velocity)
+
+    level = echo_amplitude(frame, 0.1)
+    return sum_over_points(setup, frame, places, lambda *_: body.amplitude * level, mirrors, loss)
 
 
 @pytest.mark.parametrize("rev_per_min", [6000.0, 0.0])
@@ -137,12 +112,10 @@ def test_samples_are_the_sum_over_points_at_every_sample(rev_per_min):
     of a hundred times the slots."""
     rotors = {"number": 2, "blade_length_m": 0.05, "arm_m": 0.3, "rev_per_min": rev_per_min}
     rotors["blade_dbsm"] = 10.0  # over the rounding of the body's samples
-    setup = irt.prepare(scenario(rotors=rotors))
-    frame = setup.frame(1)
-    body = irt.prepare(scenario())
-    found = synthesised(setup, frame, irt.Direct()) - synthesised(body, body.frame(1), irt.Direct())
-    truth = sum_of_points(setup, frame)
-    assert np.linalg.norm(found - truth) < 5e-4 * np.linalg.norm(truth)
+    s = scenario(chirps=12, rotors=rotors)
+    frame, body = (irt.prepare(x).frame(1) for x in (s, scenario(chirps=12)))
+    found = samples_of(frame._setup, frame) - samples_of(body._setup, body)
+    assert error_of(found, of_rotors(s, frame)) < 5e-4
 
 
 def test_bistatic_edge_is_two_v_cos_half_beta_over_lambda():
@@ -212,6 +185,123 @@ def test_energy_of_a_turn_is_that_of_the_integral():
 
     mean = quad(pattern, 0, np.pi / 2, limit=500)[0] / (np.pi / 2)
     assert np.mean(np.abs(signal) ** 2) == pytest.approx(blade_section(rotors) * mean, rel=1e-3)
+
+
+PLATES = Rotors(number=2, blade_length_m=0.05, chord_m=0.015, rev_per_min=6000.0)
+
+
+def grid(rotors, angle, lead, hub):
+    """Places (..., K, 3) on one flat blade at angles (...), normals (..., 3) and weights (K,)."""
+    (along, of_length), (across, of_chord) = map(np.polynomial.legendre.leggauss, (60, 24))
+    tilt = np.radians(rotors.incidence_deg)
+    turned = np.stack([np.sin(angle), np.cos(angle), 0 * angle], axis=-1)
+    ahead = lead * np.stack([np.cos(angle), -np.sin(angle), 0 * angle], axis=-1)
+    chord = np.cos(tilt) * ahead + np.sin(tilt) * np.array([0, 0, 1])
+    r = rotors.blade_length_m * (1 + along) / 2
+    c = rotors.chord_m * across / 2
+    places = r[:, None] * turned[..., None, None, :] + c[:, None, None] * chord[..., None, None, :]
+    weights = np.multiply.outer(of_chord, of_length).ravel() / 4
+    places = places.reshape(*np.shape(angle), -1, 3) + hub
+    return places, np.cross(turned, chord), weights
+
+
+def blades_and_hubs(rotors, body, time):
+    """Angle (...), lead and hub of each blade at times (...)."""
+    for b in range(rotors.number * rotors.blades):
+        where = (b // rotors.blades + 0.5) * 2 * np.pi / rotors.number
+        hub = rotors.arm_m * np.array([np.sin(where), np.cos(where), 0]) * (rotors.number > 1)
+        yield body.start[b] + body.spin[b] * time, (-1) ** (b // rotors.blades), hub
+
+
+def physical_optics(rotors, body, time, u1, u2):
+    """Amplitude of all blades at times (...): the integral over each plate by a fine grid."""
+    total, k = 0j, body.wave_number
+    for angle, lead, hub in blades_and_hubs(rotors, body, np.asarray(time)):
+        places, normal, weight = grid(rotors, angle, lead, hub)
+        obliquity = (abs(normal @ u1) + abs(normal @ u2)) / 2
+        total = total + obliquity * (np.exp(-1j * k * places @ (u1 + u2)) @ weight)
+    area = rotors.blade_length_m * rotors.chord_m
+    return total * area * k / np.sqrt(np.pi) * np.sqrt(PLASTIC)
+
+
+@pytest.mark.parametrize("bistatic", [False, True])
+def test_a_flat_blade_equals_its_integral_of_physical_optics(bistatic):
+    """At generic directions to 1e-4 of the flash, and on the normal to 4 pi A^2/lambda^2. Planted
+    bugs: `chord @ incident` for `chord @ both`; the phase of `nodes` with the other sign; `lead`
+    left out of `side`; `np.sin(tilt)` of the places without."""
+    w, rng = irt.Waveform(num_chirps=6), np.random.default_rng(3)
+    body = blades_of(PLATES, w, 1, "U")
+    k, flash = body.wave_number, np.sqrt(blade_section(PLATES, body.wave_number))
+    for _ in range(10):
+        u1, u2 = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+        u2, t = u2 if bistatic else u1, np.array([rng.uniform(0, 1)])
+        gain = body.amplitudes(u1, u2, t)[0]
+        found = gain.conj() @ np.exp(-1j * k * body.motion(t).place[0] @ (u1 + u2))
+        truth = physical_optics(PLATES, body, t[0], u1, u2)
+        assert abs(found - truth) < 1e-4 * flash
+    tilt = np.radians(PLATES.incidence_deg)
+    angle = body.start[0]  # at time 0, seen along the normal of the first rotor's first blade
+    back = -np.array([np.cos(angle), -np.sin(angle), 0])
+    normal = np.sin(tilt) * back + np.cos(tilt) * np.array([0, 0, 1])
+    one = blades_of(PLATES.model_copy(update={"number": 1, "blades": 1}), w, 1, "U")
+    own = body.start[0] - one.start[0]
+    assert own == pytest.approx(0)
+    gain = one.amplitudes(normal, normal, np.zeros(1))[0]
+    echo = gain.conj() @ np.exp(-2j * k * one.motion(np.zeros(1)).place[0] @ normal)
+    assert abs(echo) == pytest.approx(flash, rel=1e-6)
+    assert 4 * np.pi * (0.05 * 0.015 / (2 * np.pi / k)) ** 2 * PLASTIC == pytest.approx(flash**2)
+
+
+def test_energy_of_flat_blades_is_that_of_the_integral():
+    """Mean power of all blades over a turn, each by itself. Planted bug: `x` of the chord."""
+    u1, u2 = np.array([0.1, 0.3, -1.0]), np.array([0.0, -0.2, -1.0])
+    u1, u2 = u1 / np.linalg.norm(u1), u2 / np.linalg.norm(u2)
+    one = PLATES.model_copy(update={"blades": 1, "number": 1})
+    alone = blades_of(one, irt.Waveform(num_chirps=6), 1, "U")
+    turns = np.arange(400) / 400 / (PLATES.rev_per_min / 60)
+    power = np.abs(physical_optics(one, alone, turns, u1, u2)) ** 2
+    assert alone.mean_section(u1, u2) == pytest.approx(power.mean(), rel=1e-3)
+
+
+def test_a_flat_blade_seen_from_its_edge_is_dark():
+    """Without incidence and in the plane of the rotors. Planted bug: obliquity of 1."""
+    flat = blades_of(PLATES.model_copy(update={"incidence_deg": 0.0}), irt.Waveform(), 1, "U")
+    ahead = np.array([0.0, 1.0, 0.0])
+    assert np.abs(flat.amplitudes(ahead, ahead, np.linspace(0, 0.1, 7))).max() < 1e-12
+    assert flat.mean_section(ahead, ahead) < 1e-24
+
+
+def test_samples_of_flat_blades_are_the_integral_at_every_sample():
+    """0.3 % of the sum of physical optics over a fine grid, with its phase and obliquity at every
+    sample; obliquity changes by 0.6 % in half a slot. Planted bugs: one node; amplitudes at the
+    epoch in all slots."""
+    rotors = {"number": 1, "arm_m": 0.0, "blades": 1, "blade_length_m": 0.05, "chord_m": 0.015}
+    rotors |= {"incidence_deg": 30.0, "blade_dbsm": 10.0}
+    flight = {"position_m": [1.0, 4.0, 5.0], "velocity_mps": [3.0, -4.0, 0.0]}
+    s = scenario(chirps=3, rotors=rotors, **flight)
+    setup = irt.prepare(s)
+    frame, q = setup.frame(1), setup.frame(1).poses["T"]
+    echo = frame.paths[OWN]
+    moving = setup.moving_centres.with_centres(echo, frame.poses, echo.epoch)
+    found = samples_of(setup, frame, moving.select(np.arange(1, len(moving))))
+    body, r = blades_of(s.swarm["T"].rotors, setup.waveform, s.seed, "T"), s.swarm["T"].rotors
+    axes = centres.body_axes(setup.swarm, "T", echo.epoch)
+    u = (frame.poses["radar"].position - q.position) @ axes
+    u /= np.linalg.norm(u)
+
+    def blades(t):
+        return [grid(r, *blade) for blade in blades_and_hubs(r, body, t)]
+
+    def places(t):
+        body_places = np.concatenate([places for places, *_ in blades(t)], axis=1)
+        return q.position + np.outer(t - echo.epoch, q.velocity)[:, None] + body_places @ axes.T
+
+    def amplitudes(t, _):
+        parts = [np.abs(normal @ u)[:, None] * weight for _, normal, weight in blades(t)]
+        return np.concatenate(parts, axis=1) * np.sqrt(10) * echo_amplitude(frame, 0.1)
+
+    truth = sum_over_points(setup, frame, places, amplitudes)
+    assert error_of(found, truth) < 3e-3
 
 
 def test_blades_seen_along_the_axis_only_shift_the_phase_by_spreading():
@@ -295,90 +385,50 @@ def test_ghosts_follow_the_centre_over_the_mirror():
         assert pieces.tx_radius[row] == pytest.approx(np.linalg.norm(point - mirrored), abs=1e-3)
 
 
-def over_ground(frame, middle):
-    """Echo of Q from the radar with those by way of the ground, z = 0, which reflects by -0.8."""
-    radar, q = (frame.poses[name] for name in ("radar", "Q"))
-    images = np.array([radar.position, radar.position * [1, 1, -1]])
-
-    def delay(t):
-        ways = np.linalg.norm(q.position + np.multiply.outer(t, q.velocity) - images, axis=-1)
-        return (ways[..., :, None] + ways[..., None, :]).ravel() / SPEED_OF_LIGHT
-
-    h = 1e-4
-    before, now, after = (delay(t) for t in (-h, 0.0, h))
-    away = q.position - images
-    share = images[1, 2] / (images[1, 2] - q.position[2])
-    hit = images[1] + share * away[1]
-    unit = away / np.linalg.norm(away, axis=1)[:, None] * [[1, 1, 1], [1, 1, -1]]
-    nowhere = np.full(3, np.nan)
-    there, back = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
-    points = [
-        [hit if a else nowhere, q.position, hit if b else nowhere]
-        for a, b in zip(there, back, strict=True)
-    ]
-    return make_paths(
-        gain=1e-6 * (-0.8) ** (there + back),
-        delay=now,
-        delay_rate=(after - before) / (2 * h),
-        delay_accel=(after - 2 * now + before) / h**2,
-        departure=unit[there],
-        arrival=unit[back],
-        tx_radius=np.linalg.norm(away, axis=1)[there],
-        rx_radius=np.linalg.norm(away, axis=1)[back],
-        kind=np.where(there + back, PathKind.GHOST, PathKind.TARGET),
-        target=1,
-        bounces=there + back,
-        points=points,
-        faces=[[a - 1, -1, b - 1] for a, b in zip(there, back, strict=True)],
-        tx="radar",
-        rx="radar",
-        epoch=middle,
-        target_names=("radar", "Q"),
-    )
-
-
 def test_ground_multipath_is_the_sum_over_images_at_every_sample():
     """Four paths to each point, 0.05 %. Planted bugs: `mirror` of one end for both; `points[:at]`
     for `points[:at:-1]`; spreading of the way there alone."""
     s = scenario(rotors={"number": 1, "arm_m": 0.1, "blade_length_m": 0.03}, chirps=12)
     setup = irt.prepare(s)
-    frame, w, antennas = setup.frame(1), setup.waveform, setup.arrays.of("radar")
-    middle = setup.timetable.epoch(1)
-    paths = over_ground(frame, middle)
+    frame, middle = setup.frame(1), setup.timetable.epoch(1)
+    paths = over_ground(frame, -0.8)
     moving = setup.moving_centres.with_centres(paths, frame.poses, middle)
-    links = [(frame.sent["radar"], moving.select(np.arange(4, len(moving))))]
-    found = irt.if_signal(w, links, *frame._listening(OWN), irt.Direct()).samples
-    radar, q, sent = frame.poses["radar"], frame.poses["Q"], frame.sent["radar"]
-    body = blades_of(s.swarm["Q"].rotors, w, s.seed, "Q")
-    tx, rx = (
-        radar.position + radar.to_world(r) for r in (antennas.tx_positions, antennas.rx_positions)
-    )
-    section = setup.reference.sections["Q"].square_metres(*2 * [np.array([0.0, 1.0, 0.0])])
-    forward = q.velocity * [1, 1, 0] / np.hypot(*q.velocity[:2])
-    right = np.array([forward[1], -forward[0], 0.0])
-    flip = np.array([[1, 1, 1], [1, 1, -1]])
-    truth = np.zeros(found.shape, complex)
-    for p, k in np.ndindex(w.num_chirps, body.radius.size):
-        t = p * w.slot_duration + w.fast_time - w.frame_duration / 2
-        angle = body.phase[k] + body.turning[k] * (t + middle)
-        place = q.position + np.outer(t, q.velocity)
-        arm = np.outer(np.sin(angle), right) + np.outer(np.cos(angle), forward)
-        point = place + body.hub[k, 0] * right + body.hub[k, 1] * forward + body.radius[k] * arm
-        level = body.amplitude[k] / np.sqrt(section) * sent.amplitude * 1e-6
+    found = samples_of(setup, frame, moving.select(np.arange(4, len(moving))))
+    assert error_of(found, of_rotors(s, frame, OVER_GROUND, -0.8)) < 5e-4
 
-        def way(element, image, point=point):
-            return np.linalg.norm(point - element * flip[image], axis=1)
 
-        spread = [
-            np.linalg.norm(place - radar.position * f, axis=1)
-            / np.linalg.norm(point - radar.position * f, axis=1)
-            for f in flip
-        ]
-        for r, a, b in np.ndindex(len(rx), 2, 2):
-            tau = (way(tx[sent.schedule[0, p]], a) + way(rx[r], b)) / SPEED_OF_LIGHT
-            wave = np.exp(2j * np.pi * w.phase(tau, w.fast_time))
-            truth[0, r, p] += level * (-0.8) ** (a + b) * spread[a] * spread[b] * wave
-    assert np.linalg.norm(found - truth) < 5e-4 * np.linalg.norm(truth)
+@pytest.mark.parametrize("one_place", [True, False])
+def test_own_blades_are_the_sum_over_points_at_every_sample(one_place):
+    """Echoes of a radar's own blades at 25 to 35 cm, within what the plan states: 0.7 % with all
+    antennas in one place, for the spreading changes within a slot. Planted bugs: `distance` for
+    `2 * distance`; `distance` once in the radar equation; the pose's axes for the body's."""
+    rotors = {"number": 2, "arm_m": 0.3, "blade_length_m": 0.05, "height_m": 0.05}
+    flight = {"position_m": [1.0, 6.0, 1.5], "rcs": {"model": "constant"}}
+    array = {"tx": [[0, 0], [1e-6, 0], [0, 1e-6]], "rx": [[0, 0], [2e-6, 0], [0, 2e-6], [3e-6, 0]]}
+    array = {end: {"positions": of} for end, of in array.items()}
+    own = {"rotors": rotors, "boresight": [0.3, 1, 0]} | ({"array": array} if one_place else {})
+    s = scene(flight, 12, **own)
+    setup = irt.prepare(s)
+    frame = setup.frame(1)
+    echo, antennas = frame.paths[OWN], setup.arrays.of("radar")
+    own = setup.moving_centres.own_echoes(echo, frame.poses, 0.0)
+    found = samples_of(setup, frame, own)
+    body, pose = setup.moving_centres.own["radar"], frame.poses["radar"]
+    axes = centres.body_axes(setup.swarm, "radar", echo.epoch)
+
+    def places(t):
+        return pose.position + body.motion(t).place @ axes.T
+
+    def amplitudes(_, points):
+        away = points - pose.position
+        away /= np.linalg.norm(away, axis=2)[..., None]
+        gain = antennas.element_gain(pose.to_body(away))
+        return setup.waveform.wavelength / (4 * np.pi) ** 1.5 * body.amplitude * gain
+
+    error = error_of(found, sum_over_points(setup, frame, places, amplitudes))
+    rows = setup.moving_centres.report({OWN: echo}, frame.poses, {OWN: 1.0})
+    (bound,) = [row["estimate"] for row in rows if row["what"] == "own rotors of radar"]
+    assert bound / 10 < error < bound < 0.05
 
 
 def test_blades_far_below_noise_are_left_out():
@@ -423,6 +473,7 @@ def test_traced_paths_are_kept_whatever_the_rotors():
         ({"rotors": {"rev_per_min": 50_000}}, "faster than sound"),
         ({"rotors": {}, "rcs": {"model": "relative"}}, "another rcs.model"),
         ({"rotors": {"blade_length_m": 0}}, "greater than 0"),
+        ({"rotors": {"number": 1}, "role": "passive"}, "0 m from the arrays"),
     ],
 )
 def test_refused(uav, said):
