@@ -60,6 +60,9 @@ class Weather(Node):
     cloudburst. The default is none."""
     wind_mps: Vector = (0.0, 0.0, 0.0)
     """Wind that carries the drops: east, north, up [m/s]. By default drops fall straight down."""
+    turbulence_mps: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 0.0
+    """Standard deviation of the air's velocity on each axis, which widens the rain's Doppler
+    spectrum [m/s]: 0.5 in steady rain, 2 in a thunderstorm. The default is calm air."""
     temperature_c: Annotated[float, Field(ge=-40, le=60, allow_inf_nan=False)] = 15.0
     """Temperature of air and drops [degrees Celsius]. The default is ITU's."""
     pressure_hpa: Annotated[float, Field(ge=300, le=1100, allow_inf_nan=False)] = 1013.25
@@ -68,7 +71,7 @@ class Weather(Node):
     """Density of water vapour [g/m^3], 12.8 at most at 15 degrees. The default is ITU's."""
 
     def applies(self, name: str) -> bool:
-        return name != "wind_mps" or self.rain_mm_per_h > 0
+        return name not in ("wind_mps", "turbulence_mps") or self.rain_mm_per_h > 0
 
     def problems(self) -> Iterator[Problem]:
         celsius = self.temperature_c

@@ -12,10 +12,10 @@ on ellipsoids about ends L_0 apart, d = r_1 - r_2. With d = s tanh(w), dd/(r_1 r
 that scatterers that are uniform in s, w and the angle phi have equal shares of the radar equation.
 
 Paths, and not noise of the same power, are the right form for an FMCW radar with several antennas:
-the drops' echoes have a place in range, in Doppler by fall, wind and flight, and in the phases
-between antennas; a passive terminal's carry data. Amplitudes are circular Gaussian and hold within
-a frame while delays move. Each frame draws anew: drops whose speeds differ by 1 m/s decorrelate in
-half a wavelength over that speed, 2 ms at 77 GHz, less than a frame.
+the drops' echoes have a place in range, in Doppler by fall, wind, turbulence and flight, and in the
+phases between antennas; a passive terminal's carry data. Amplitudes are circular Gaussian and hold
+within a frame while delays move. Each frame draws anew: drops whose speeds differ by 1 m/s
+decorrelate in half a wavelength over that speed, 2 ms at 77 GHz, less than a frame.
 """
 
 from __future__ import annotations
@@ -130,16 +130,16 @@ class Weathered:
         rng = generator(self._free.seed, "rain", *state.link, repr(float(state.epoch)))
         points, weight = self._places(state, rng)
         classes, expected = self._classes(len(points), rng)
-        velocity = np.array(self._settings.wind_mps) - np.array([0, 0, 1.0]) * fall_speed(
-            DIAMETERS_MM[classes]
-        ).reshape(-1, 1)
+        white = rng.standard_normal((len(points), 2)) @ np.array([1, 1j]) / np.sqrt(2)
+        velocity = self._settings.turbulence_mps * rng.standard_normal(points.shape)
+        velocity += self._settings.wind_mps
+        velocity[:, 2] -= fall_speed(DIAMETERS_MM[classes])
         there, back = (straight(end, points, velocity) for end in (state.start, state.end))
         ways = ScatterPaths.over(there, back)
         section = expected * self.drops.cross_sections(classes, there.departure, back.arrival)
         amplitude = np.sqrt(self._free.wavelength**2 / (4 * np.pi) ** 3 * weight * section)
         amplitude *= state.elements(self._free.arrays, ways)
         amplitude[self._occlusion.hidden(state, points)] = 0.0
-        white = rng.standard_normal((len(points), 2)) @ np.array([1, 1j]) / np.sqrt(2)
         return state.paths(ways, amplitude * white, PathKind.DIFFUSE)
 
     def _places(self, state: LinkState, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

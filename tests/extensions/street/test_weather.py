@@ -146,10 +146,10 @@ def test_bistatic_drops_keep_the_wave_upright():
 @pytest.mark.slow
 def test_spectrum_of_rain_is_that_of_falling_drops():
     """Straight above, speeds follow their backscatter: mean and spread of the closing velocity;
-    level in the wind's direction, twice the wind along the path. Planted bug: drops that rise; wind
-    of the opposite sign."""
+    level in the wind's direction, the wind and its turbulence alone. Planted bug: drops that rise;
+    wind of the opposite sign; turbulence on one axis; its variance for its deviation."""
     ends = {"A": Pose.at_rest((0, 0, 2))}
-    settings = Weather(rain_mm_per_h=RAIN, wind_mps=(3, 0, 0))
+    settings = Weather(rain_mm_per_h=RAIN, wind_mps=(3, 0, 0), turbulence_mps=0.6)
     weather, _ = rainy(Antennas(), settings)
     found = rain_of(weather, Link("A", "A"), ends, 60)
     rate, up, east, power = (
@@ -169,9 +169,11 @@ def test_spectrum_of_rain_is_that_of_falling_drops():
     own = power[above] / power[above].sum()
     assert -(own @ rate[above]) == pytest.approx(mean, rel=0.05, abs=0)
     shown = np.sqrt(own @ (rate[above] + mean) ** 2)
-    assert shown == pytest.approx(spread, rel=0.15, abs=0)
+    assert shown == pytest.approx(np.hypot(spread, 0.6), rel=0.08, abs=0)
     along = (east > np.cos(0.1)) & (np.abs(up) < 0.02)
     assert np.average(rate[along], weights=power[along]) == pytest.approx(3.0, abs=0.1)
+    width = np.sqrt(np.average((rate[along] - 3.0) ** 2, weights=power[along]))
+    assert width == pytest.approx(0.6, rel=0.1, abs=0)
 
 
 def test_a_frame_draws_rain_anew_and_the_same_frame_the_same():
