@@ -239,7 +239,7 @@ MAX_LINES = {
     "kernels": 4060,
     "frame": 2831,
     "world": 3824,
-    "propagation": 4776,
+    "propagation": 4779,
     "signal": 837,
     "receive": 6083,
     "track": 1949,
