@@ -534,6 +534,19 @@ OF_CASES = {
         "slope=w.slope - train.slope * speed**2",
         "slope=w.slope + train.slope * speed**2",
     ),
+    "moving walls": Bug(
+        "extensions/street/faces.py", "rise = turn @ place + ", "rise = 0 * turn @ place + "
+    ),
+    "uavs in moving walls": Bug(
+        "extensions/street/faces.py",
+        "velocity=end.velocity - 2 * (rise * normal + height * turn)",
+        "velocity=end.velocity - 2 * rise * normal",
+    ),
+    "sliding shadows": Bug(
+        "extensions/street/shadows.py",
+        "for part in self._parts(paths, chain + velocity * time, box)",
+        "for part in self._parts(paths, chain, box)",
+    ),
 }
 """For each case of `isac-rt validate` one bug with which it fails (``--planted``)."""
 

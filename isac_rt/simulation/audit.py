@@ -129,10 +129,11 @@ def make_plan(setup: Setup) -> dict[str, Any]:
 def _items(setup: Setup, frames: Sequence[int]) -> list[Item]:
     """Return the items of the terminals of one chirp, from the paths of some frames."""
     uses: dict[Link, list[Use]] = {}
-    light, next_slot, short_lived = 0.0, 0.0, 0
+    light, next_slot, short_lived, seen = 0.0, 0.0, 0, []
     for frame in frames:
         _LOG.info("tracing frame %d, one of %d", frame, len(frames))
         poses, traced = setup.find(frame)
+        seen.append((poses, traced))
         fastest = max(float(np.linalg.norm(pose.velocity)) for pose in poses.values())
         last = setup.frame_of(frame, poses, traced)
         for link, use in last.uses.items():
@@ -153,6 +154,8 @@ def _items(setup: Setup, frames: Sequence[int]) -> list[Item]:
         }
         rows = setup.moving_centres.report(traced, poses, over_noise)
         items += [Item(**row) for row in rows]
+    if setup.boxes is not None:
+        items += [Item(**row) for row in setup.boxes.report(seen)]
     items += [] if setup.has_ideal_hardware else _hardware_items(last)
     return (
         items

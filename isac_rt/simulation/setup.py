@@ -185,13 +185,30 @@ class Frame:
         for name in dict.fromkeys([link.tx, *self.sent]):
             clock = s.connections.clock_difference(name, link, when)
             paths = self.paths[Link(name, link.rx)]
-            if s.moving_centres is not None:
-                cell = s.plan.cell_noise_gain(name) / s.waveform.num_chirps  # of one chirp
-                least = s.plan.weakest * self.noise_power(link) / cell
-                paths = s.moving_centres.with_centres(paths, self.poses, when, least)
+            if s.moving_centres is not None or s.boxes is not None:
+                paths = self._moving(paths, when, s.plan.weakest * self.noise_power(link))
             sent = replace(self.sent[name], clock_offset=clock.offset, clock_drift=clock.drift)
             out += [(stream, paths) for stream in sent.streams()]
         return out
+
+    def _moving(self, paths: PathSet, when: float, least: float) -> PathSet:
+        """Return the paths of a link with moving centres and shadows that change in the frame.
+
+        Parameters
+        ----------
+        when : middle of the receiver's frame [s]
+        least : power of a sample over all chirps below which neither matters [W]
+        """
+        s = self._setup
+        least /= s.plan.cell_noise_gain(paths.tx) / s.waveform.num_chirps  # of one chirp
+        shadow = None
+        if s.boxes is not None:
+            shadow = s.boxes.shadows(paths, self.poses).over_time
+        if s.moving_centres is not None:
+            paths = s.moving_centres.with_centres(paths, self.poses, when, least, shadow)
+        if s.boxes is not None:
+            paths = s.boxes.in_pieces(paths, self.poses, when - paths.epoch, least)
+        return paths
 
     def _listening(self, link: Link) -> tuple[ReceiveArray, Reference]:
         """Return the receive array and the reference chirps of a link's receiver."""
@@ -316,6 +333,16 @@ class Setup:
             return None
         make, sections = extension("moving_centres"), self.reference.sections
         return make(self.swarm, sections, self.waveform, self.arrays, self.scenario.seed)
+
+    @cached_property
+    def boxes(self) -> Any:
+        """Boxes of UAVs (`isac_rt.extensions.street.boxes.Boxes`); None without."""
+        if not any(uav.box for uav in self.swarm.uavs.values()):
+            return None
+        model: Any = self.propagation
+        while not isinstance(model, extension("boxes")):
+            model = model.model
+        return model
 
     @cached_property
     def emitters(self) -> Any:

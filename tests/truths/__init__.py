@@ -10,6 +10,7 @@ def all_cases(quick: bool = False) -> list[Case]:
     """All cases, or the quick selection, in the order of their groups."""
     from truths import (
         amplitude,
+        cars,
         clutter,
         crosschecks,
         geometry,
@@ -35,6 +36,7 @@ def all_cases(quick: bool = False) -> list[Case]:
         measured,
         crosschecks,
         street,
+        cars,
     )
     cases = [case for module in modules for case in cases_of(module)]
     return [case for case in cases if case.quick or not quick]

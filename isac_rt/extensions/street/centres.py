@@ -20,7 +20,7 @@ before synthesis: what scores and draws paths sees the UAV's own, and stored pat
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -28,7 +28,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from isac_rt.extensions.street.extent import fixed_of
-from isac_rt.extensions.street.motion import PHASE_ERROR, CentreModel, Motion
+from isac_rt.extensions.street.motion import PHASE_ERROR, CentreModel, Motion, pieces
 from isac_rt.extensions.street.rotors import Blades, blades_of
 from isac_rt.extensions.street.walker import walker_of_flight
 from isac_rt.frame.antennas import Arrays
@@ -91,6 +91,7 @@ class MovingCentres:
         poses: Mapping[str, Pose],
         middle: float,
         least_power: float = 0.0,
+        shadow: Callable[[PathSet, np.ndarray], np.ndarray] | None = None,
     ) -> PathSet:
         """Return a link's paths with those over centres, piece by piece of the frame.
 
@@ -99,8 +100,10 @@ class MovingCentres:
         poses : at the paths' epoch
         middle : of the receiver's frame [s]
         least_power : |gain|^2 of all centres together that a path over them must exceed
+        shadow : factor of a path's amplitude at times [s since the epoch], in a frame in which it
+            changes
         """
-        target = np.array([*paths.target_names, ""])[paths.target]
+        target = _echoing(paths)
         gives_way = [name for name, model in self.models if model.replaces_echo]
         parts = [paths.select(~np.isin(target, gives_way))]
         later = middle - paths.epoch
@@ -113,6 +116,8 @@ class MovingCentres:
                 offset = of[2].turned(model.motion(paths.epoch + time), time)
                 for base in bases:
                     amplitudes = model.amplitudes(*base.towards, paths.epoch + time)
+                    if shadow is not None:
+                        amplitudes = amplitudes * shadow(base.path, time)[:, None]
                     parts.append(_copies(base, amplitudes, offset, begin, time))
         own = self.own_echoes(paths, poses, later)
         if own is not None and (own.power.sum() > least_power * self.waveform.num_chirps):
@@ -197,7 +202,7 @@ class MovingCentres:
         for name, model in self.models:
             level, parts = -np.inf, model.described()
             for link, paths in found.items():
-                which = np.array([*paths.target_names, ""])[paths.target] == name
+                which = _echoing(paths) == name
                 of = name, model, self._attitude(name, paths.epoch)
                 for base in self._bases(paths, which, poses, of):
                     power = base.power * over_noise[link]
@@ -245,12 +250,7 @@ class MovingCentres:
     def pieces(self, slots: int, later: float) -> tuple[np.ndarray, np.ndarray]:
         """Return when pieces of so many slots begin and the last ends (T + 1,), and their middles
         (T,) [s since the epoch], the middle of the frame `later` than the epoch."""
-        w = self.waveform
-        first = np.append(np.arange(0, w.num_chirps, slots), w.num_chirps)
-        begin = first * w.slot_duration - w.frame_duration / 2 + later
-        samples = w.window_start, w.chirp_duration + (w.num_groups - 1) * w.group_spacing
-        middle = (begin[:-1] + begin[1:] - w.slot_duration + sum(samples)) / 2
-        return (np.array([-np.inf, np.inf]) if middle.size == 1 else begin), middle
+        return pieces(self.waveform, slots, later)
 
     def _slots_of_piece(
         self,
@@ -369,6 +369,12 @@ class Base(NamedTuple):
     towards: tuple[np.ndarray, np.ndarray]
     gain: np.ndarray
     power: float
+
+
+def _echoing(paths: PathSet) -> np.ndarray:
+    """Return the UAV (K,) whose echo each path is, over walls at rest; empty without."""
+    target = np.where((paths.faces < -1).any(axis=1), -1, paths.target)
+    return np.array([*paths.target_names, ""])[target]
 
 
 def _copies(

@@ -6,6 +6,8 @@ from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
+from isac_rt.frame.waveform import Waveform
+
 PHASE_ERROR = 1e-3
 """Largest phase error [rad] at the ends of a piece; 0.06 % of its samples on average."""
 
@@ -53,3 +55,13 @@ class CentreModel(Protocol):
     def motion(self, time: np.ndarray) -> Motion:
         """Return the centres' motion from the UAV's position at times (T,) [s]."""
         ...
+
+
+def pieces(w: Waveform, slots: int, later: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return when pieces of a frame of so many slots begin and the last ends (T + 1,), and their
+    middles (T,) [s since the epoch], the middle of the frame `later` than the epoch."""
+    first = np.append(np.arange(0, w.num_chirps, slots), w.num_chirps)
+    begin = first * w.slot_duration - w.frame_duration / 2 + later
+    samples = w.window_start, w.chirp_duration + (w.num_groups - 1) * w.group_spacing
+    middle = (begin[:-1] + begin[1:] - w.slot_duration + sum(samples)) / 2
+    return (np.array([-np.inf, np.inf]) if middle.size == 1 else begin), middle

@@ -11,13 +11,28 @@ from fake_run import fake_run
 from matplotlib.figure import Figure
 from scipy.integrate import quad
 from scipy.special import fresnel
+from truths.cars import (
+    HALF,
+    LINK,
+    OWN,
+    POINT,
+    WAVEFORM,
+    WAVELENGTH,
+    box_of,
+    echoes_over,
+    mirrors,
+    paths_at,
+    stage,
+    stage_with_uav,
+    traced_anew,
+    turning,
+)
 
 import isac_rt as irt
 from isac_rt.document import ScenarioError
 from isac_rt.extensions.street.boxes import Boxes
-from isac_rt.frame.antennas import Antennas, Arrays
-from isac_rt.frame.link import Link
-from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
+from isac_rt.extensions.street.shadows import _with_reflections
+from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.runtime import UserError
@@ -25,84 +40,15 @@ from isac_rt.simulation.simulate import _with_boxes
 from isac_rt.views.figures import scene_map
 from isac_rt.views.scene import moving_scene, scene_3d
 from isac_rt.world.city.mesh import empty_city
-from isac_rt.world.settings import Box, Uav, Waypoint
+from isac_rt.world.settings import Uav
 from isac_rt.world.swarm import Swarm
 
-WAVEFORM = Waveform()
-WAVELENGTH = WAVEFORM.wavelength
-HALF = WAVEFORM.frame_duration / 2
-LINK, OWN = Link("AT", "PT"), Link("AT", "AT")
-POINT = Arrays(Antennas(tx_x=1, tx_z=1, rx_x=1, rx_z=1, spacing=0.0, gain=1.0))
+SCENES = Path(__file__).parents[3] / "scenes"
 
 
-def box_of(size=(0.4, 8.0, 5.0), material="metal", **flight):
-    return Uav(role="target", box=Box(size_m=size, material=material), **flight)
-
-
-def turning(yaw_deg, places=((3.0, 9.0, 2.0), (3.4, 9.2, 2.1), (3.9, 9.3, 2.2)), tilt=1.0):
-    """A box on three waypoints, with their yaw and some pitch and roll."""
-    points = [
-        Waypoint(time_s=t, position_m=p, attitude_deg=(yaw, 2 * tilt * t, -3 * tilt * t))
-        for t, p, yaw in zip((0.0, 0.5, 1.0), places, yaw_deg, strict=True)
-    ]
-    return box_of(waypoints=points)
-
-
-def stage(box, at=(-9.0, 3.0, 2.5), pt=(-8.0, 14.0, 1.5), velocities=((1, 0.5, 0), (0, -1, 0.2))):
-    uavs = {
-        "AT": Uav(role="active", position_m=at, velocity_mps=velocities[0]),
-        "PT": Uav(role="passive", position_m=pt, velocity_mps=velocities[1]),
-        "box": box,
-    }
-    swarm = Swarm(uavs, 1.0)
-    free = FreeSpace(uavs, POINT, WAVELENGTH, 3)
-    return swarm, Boxes(swarm, {}, free, free, WAVEFORM, None)
-
-
-def paths_at(swarm, model, epoch, link=LINK):
-    return model.trace(swarm.poses(epoch), epoch, [link]).paths[link]
-
-
-def mirrors(swarm, model, epoch, link=LINK):
-    paths = paths_at(swarm, model, epoch, link)
-    return paths.select(paths.kind == PathKind.SPECULAR)
-
-
-def face_at(swarm, t):
-    """Corners of the face to the left, in order."""
-    pose, half = swarm.trajectories["box"].pose(t), np.array(swarm.uavs["box"].box.size_m) / 2
-    signs = np.array([(-1, -1, -1), (-1, 1, -1), (-1, 1, 1), (-1, -1, 1)])
-    return pose.position + (signs * half) @ pose.rotation.T
-
-
-def traced_anew(swarm, t, link=LINK):
-    """Length over the plane of the face at an instant, and whether its point is on the face."""
-    corners = face_at(swarm, t)
-    normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
-    normal /= np.linalg.norm(normal)
-    first, last = (swarm.trajectories[name].pose(t).position for name in link)
-    heights = [normal @ (end - corners[0]) for end in (first, last)]
-    length = np.sqrt(((first - last) ** 2).sum() + 4 * heights[0] * heights[1])
-    feet = [end - h * normal for end, h in zip((first, last), heights, strict=True)]
-    point = (feet[0] * heights[1] + feet[1] * heights[0]) / (heights[0] + heights[1])
-    sides = np.roll(corners, -1, axis=0) - corners
-    inside = (np.cross(sides, point - corners) @ normal > 0).all()
-    return length, inside and heights[0] * heights[1] > 0
-
-
-@pytest.mark.parametrize(("link", "yaw"), [(LINK, 0.0), (OWN, -40.0)])
-def test_a_moving_wall_is_traced_anew_in_every_chirp(link, yaw):
-    """Delays over the frame to 1e-6 wavelengths; the wall moves and turns. Planted bugs: `rise`
-    without `turn @ place`; `rise * turn` once; the wall at rest."""
-    steady = ((3.0, 9.0, 2.0), (3.4, 9.2, 2.1), (3.8, 9.4, 2.2))
-    swarm, model = stage(turning((yaw, yaw + 2, yaw + 4), steady, 0.0))
-    path = mirrors(swarm, model, 0.4, link)
-    assert len(path) == 1
-    times = WAVEFORM.chirp_time[0] + WAVEFORM.window_start - HALF
-    anew = np.array([traced_anew(swarm, 0.4 + t, link)[0] for t in times])
-    ours = path.delay + path.delay_rate * times + path.delay_accel * times**2 / 2
-    assert ours * SPEED_OF_LIGHT == pytest.approx(anew, abs=1e-6 * WAVELENGTH, rel=0)
-    assert path.tx_radius == pytest.approx(path.delay * SPEED_OF_LIGHT)
+@pytest.fixture(scope="module")
+def traffic():
+    return irt.prepare(irt.load(SCENES / "street_traffic.yaml"))
 
 
 @pytest.mark.parametrize(("link", "yaw"), [(LINK, 0.0), (OWN, -40.0)])
@@ -116,6 +62,41 @@ def test_a_wall_that_speeds_up_has_its_rate_and_acceleration(link, yaw):
     assert path.delay[0] * SPEED_OF_LIGHT == pytest.approx(now, abs=1e-12)
     assert rate == pytest.approx((after - before) / (2 * h), abs=2e-6)
     assert accel == pytest.approx((after - 2 * now + before) / h**2, abs=1e-5)
+
+
+@pytest.mark.parametrize("link", [LINK, OWN])
+def test_a_uav_in_a_side_echoes_by_the_radar_equation(link):
+    """Over the side before, behind and both; metal scatters a twentieth. Planted bugs: `to.length`
+    twice; the echo of the box itself."""
+    swarm, model = stage_with_uav()
+    over = echoes_over(swarm, model, 0.4, link)
+    assert over.bounces.tolist() == [1, 1, 2]
+    radar = WAVELENGTH / (4 * np.pi) ** 1.5 / (over.tx_radius * over.rx_radius)
+    assert np.abs(over.gain) == pytest.approx(radar * (1 - 0.01) ** (over.bounces / 2), rel=0.05)
+
+
+def test_points_of_reflection_move_with_both_ends():
+    """Two walls in turn by images, differences over 1 ms; a UAV on the way is where it is. Planted
+    bugs: the shares of both rays exchanged; one sweep."""
+    ends = np.array([[4.0, -3, 1], [6.0, 9, 2]]), np.array([[9.0, 4, -2], [-5.0, 7, 3]])
+    walls = np.array([[-1.0, 0, 0], [0.6, 0.8, 0]]), np.array([5.0, 12.0])  # n x = d
+
+    def points(t):
+        first, last = ends[0] + ends[1] * t
+        images = [first]
+        for n, d in zip(*walls, strict=True):
+            images.append(images[-1] - 2 * (n @ images[-1] - d) * n)
+        out = [last]
+        for n, d, image in zip(walls[0][::-1], walls[1][::-1], images[::-1], strict=False):
+            share = (d - n @ image) / (n @ (out[0] - image))
+            out.insert(0, image + share * (out[0] - image))
+        return np.array([first, *out])
+
+    h, now = 1e-4, points(0.0)
+    velocity = np.zeros((1, 4, 3))
+    velocity[0, [0, 3]] = ends[1]
+    found = _with_reflections(now[None], velocity, np.array([[False, True, True, False]]))
+    assert found[0] == pytest.approx((points(h) - points(-h)) / (2 * h), abs=1e-5)
 
 
 def test_directions_lead_to_the_point_of_reflection():
@@ -244,16 +225,15 @@ def test_a_box_hides_others_and_not_its_own_echo():
 def test_bad_boxes_are_refused_with_their_key():
     with pytest.raises(UserError, match=r"swarm.box.box.material: .*marzipan.*known are"):
         stage(box_of(material="marzipan", position_m=(0, 0, 0)))
-    scene = Path(__file__).parents[3] / "scenes" / "quadcopter.yaml"
+    scene = SCENES / "quadcopter.yaml"
     with pytest.raises(ScenarioError, match=r"radar.box.*: is for targets"):
         irt.load(scene, ["swarm.radar.box={size_m: [1, 2, 1]}"])
 
 
-def test_a_car_hides_a_pedestrian_and_flashes():
+def test_a_car_hides_a_pedestrian_and_flashes(traffic):
     """The scene: the echo falls by 30 dB and more behind the car, whose side mirrors the radar.
     Planted bug: the shadow of one of both ways."""
-    scene = Path(__file__).parents[3] / "scenes" / "street_traffic.yaml"
-    setup = irt.prepare(irt.load(scene))
+    setup = traffic
     level, flash = [], []
     for frame in (2, 10, 18):
         paths = setup.find(frame)[1]["radar", "radar"]
@@ -291,3 +271,13 @@ def test_figures_draw_the_box_where_it_is():
     outline = scene_map(Figure().subplots(), dataset.isel(frame=slice(5))).patches[0].get_xy()
     near = np.linalg.norm(outline[:, None] - np.array(corners)[:, :2], axis=2).min(axis=1)
     assert near.max() < 1e-6 and len(outline) >= 5
+
+
+def test_the_plan_counts_what_boxes_do(traffic):
+    """Two frames of the scene: in the first the car flashes, and hides the pedestrian, seen on five
+    paths, and the wall across. Planted bug: the counts of the last frame."""
+    setup = traffic
+    frames = [setup.find(frame) for frame in (9, 19)]
+    (row,) = setup.boxes.report(frames)
+    assert row["modelled"].startswith("3 paths a frame shadowed")
+    assert row["modelled"].endswith("0.5 over faces")

@@ -1,0 +1,239 @@
+r"""Shadows of boxes that move, constant over pieces of a frame.
+
+The part of a box that lies between the ends of a straight part of a path is a screen across it, in
+the middle of that part: the smallest rectangle about its silhouette whose one side is level. By
+Babinet's principle its factor is, with `knife_edge` F of the edges at the heights u and v in
+Fresnel units,
+
+.. math:: 1 - \big(F(u_1) - F(u_2)\big)\big(F(v_1) - F(v_2)\big)
+
+exact in the Fresnel approximation for a rectangle (M. Born and E. Wolf, *Principles of Optics*,
+section 8.7). Within a frame ends, UAVs and points of reflection move on straight lines. Since
+:math:`|F'| = 1/\sqrt2` and :math:`|F(v_1) - F(v_2)| \le 1.4`, an edge that moves by one Fresnel
+unit changes the factor by one at most. Pieces of whole slots are as short as `STEP` asks.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from isac_rt.extensions.street.faces import FIRST_BOX, TINY, Box
+from isac_rt.extensions.street.motion import pieces
+from isac_rt.frame.waveform import Waveform
+from isac_rt.propagation.pathset import PathKind, PathSet, merge
+from isac_rt.propagation.scatter_paths import LinkState
+from isac_rt.propagation.segments.diffraction import LIT_REACH, fresnel_unit, knife_edge, tapered
+from isac_rt.propagation.segments.reflection import vertical
+from isac_rt.world.swarm import Pose
+
+STEP = 0.05
+"""Largest error of a shadow's factor at the ends of a piece: -26 dB of the unshadowed path."""
+RIPPLE_REACH = 1 / (np.sqrt(2) * np.pi * STEP)
+"""Fresnel units from an edge beyond which its ripple is below `STEP`."""
+SWEEPS = 20
+"""Sweeps for the velocities of chains of reflections: 1e-12 of two, 1e-6 of three in turn."""
+CORNERS = np.array(list(itertools.product((-1, 1), repeat=3)))
+EDGES = np.array([e for e in itertools.combinations(range(8), 2) if (e[0] ^ e[1]) in (1, 2, 4)])
+"""Pairs of corners that differ in one sign."""
+
+
+class Part(NamedTuple):
+    """Straight parts of K paths.
+
+    Attributes
+    ----------
+    rows : (K,) of the paths
+    starts, ends : (K, 3) [m]
+    before, total : (K,) length of the path before the part, and of all of it [m]
+    """
+
+    rows: np.ndarray
+    starts: np.ndarray
+    ends: np.ndarray
+    before: np.ndarray
+    total: np.ndarray
+
+
+@dataclass(frozen=True)
+class Shadows:
+    """Shadows of the boxes of a frame on the paths of one link.
+
+    Attributes
+    ----------
+    boxes : at the middle of the frame
+    state : of the link
+    poses : of all UAVs
+    wavelength : [m]
+    half_frame : [s]
+    """
+
+    boxes: Sequence[Box]
+    state: LinkState
+    poses: dict[str, Pose]
+    wavelength: float
+    half_frame: float
+
+    def factor(self, paths: PathSet, time: float = 0.0) -> np.ndarray:
+        """Return the factor (K,) of all boxes at a time [s since the epoch]."""
+        chain, velocity = self.stops(paths)
+        out = np.ones(len(paths), complex)
+        for box in self.boxes:
+            for part in self._parts(paths, chain + velocity * time, box):
+                rows, first, last = screen(box.at(time), part, self.wavelength)
+                screened = (knife_edge(first) - knife_edge(last)).prod(axis=1)
+                out[rows] *= tapered(1 - screened, np.maximum(first, -last).max(axis=1))
+        return out
+
+    def counts(self, paths: PathSet) -> np.ndarray:
+        """Return into how many pieces (K,) the frame is to be cut for each path."""
+        chain, velocity = self.stops(paths)
+        moved = np.zeros(len(paths))
+        fastest = np.linalg.norm(velocity, axis=2).max(initial=0.0)
+        for box in self.boxes:
+            reach = (fastest + float(np.linalg.norm(box.pose.velocity))) * self.half_frame
+            heights = np.full((3, chain.shape[1] - 1, len(paths), 4), np.nan)
+            for i, time in enumerate((-self.half_frame, 0.0, self.half_frame)):
+                parts = self._parts(paths, chain + velocity * time, box)
+                for k, part in enumerate(parts):
+                    rows, first, last = screen(box.at(time), part, self.wavelength, reach)
+                    matters = np.maximum(first, -last).max(axis=1) < LIT_REACH
+                    edges = np.concatenate([first, last], axis=1)[matters]
+                    heights[i, k, rows[matters]] = np.clip(edges, -RIPPLE_REACH, RIPPLE_REACH)
+            moved += np.nansum(np.abs(np.diff(heights, axis=0)), axis=(0, 1, 3))
+        return np.maximum(np.ceil(moved / (2 * STEP)), 1).astype(int)
+
+    def _parts(self, paths: PathSet, chain: np.ndarray, box: Box) -> Iterator[Part]:
+        """Yield the straight parts that a box may shadow, the first of all paths first."""
+        placed = np.isfinite(paths.points).any(axis=(1, 2)) | (paths.kind == PathKind.LINE_OF_SIGHT)
+        own = (paths.target == box.number) | (paths.faces == FIRST_BOX - box.number).any(axis=1)
+        lengths = np.linalg.norm(np.diff(chain, axis=1), axis=2)
+        before, total = np.cumsum(lengths, axis=1) - lengths, lengths.sum(axis=1)
+        for k in range(lengths.shape[1]):
+            rows = np.flatnonzero(placed & ~own & (lengths[:, k] > 0))
+            yield Part(rows, chain[rows, k], chain[rows, k + 1], before[rows, k], total[rows])
+
+    def stops(self, paths: PathSet) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ends of each path's straight parts (K, B + 2, 3), some of which have no
+        length, and their velocities."""
+        count, (start, end) = len(paths), (self.state.start, self.state.end)
+        ends = [np.broadcast_to(e.motion()[:2, None, None], (2, count, 1, 3)) for e in (start, end)]
+        chain = np.concatenate([ends[0][0], paths.points, ends[1][0]], axis=1)
+        velocity = np.concatenate([ends[0][1], np.zeros(paths.points.shape), ends[1][1]], axis=1)
+        faces = np.pad(paths.faces, ((0, 0), (1, 1)), constant_values=-1)
+        mirror = (faces != -1) & (paths.kind != PathKind.DIFFUSE)[:, None]
+        for box in self.boxes:
+            velocity[faces == FIRST_BOX - box.number] = box.pose.velocity
+        for index in np.unique(paths.target[paths.target >= 0]):
+            uav = self.poses[paths.target_names[index]]
+            there = (paths.target == index)[:, None] & (faces == -1)
+            there &= (np.abs(chain - uav.position) < 1e-6).all(axis=2)  # not a terminal
+            velocity[there] = uav.velocity
+        for k in range(chain.shape[1] - 2, 0, -1):
+            missing = ~np.isfinite(chain[:, k])
+            velocity[:, k] = np.where(missing, velocity[:, k + 1], velocity[:, k])
+            chain[:, k] = np.where(missing, chain[:, k + 1], chain[:, k])
+        return chain, _with_reflections(chain, velocity, mirror)
+
+    def in_pieces(
+        self, paths: PathSet, waveform: Waveform, later: float, least_power: float
+    ) -> PathSet:
+        """Return paths over `least_power` cut where their shadows change, in a frame whose middle
+        is `later` than the epoch [s]."""
+        counts = np.where(paths.power > least_power, self.counts(paths), 1)
+        slots = np.maximum(waveform.num_chirps // counts, 1)
+        now, parts = self.factor(paths), [paths.select(counts == 1)]
+        for each in np.unique(slots[counts > 1]):
+            rows = np.flatnonzero((slots == each) & (counts > 1) & (now != 0))
+            some = paths.select(rows)
+            begin, time = pieces(waveform, int(each), later)
+            for k, t in enumerate(time):
+                gain = some.gain * self.factor(some, float(t)) / now[rows]
+                lives = np.maximum(some.begin, begin[k]), np.minimum(some.end, begin[k + 1])
+                piece = replace(some, gain=gain, begin=lives[0], end=lives[1])
+                parts.append(piece.select(lives[0] < lives[1]))
+        return merge(parts)
+
+    def over_time(self, paths: PathSet, time: np.ndarray) -> np.ndarray:
+        """Return the factor of one path at times (T,) over that at the epoch."""
+        count = int(self.counts(paths)[0])
+        if count == 1 or not (now := self.factor(paths)[0]):
+            return np.ones(len(time))
+        known = np.linspace(-self.half_frame, self.half_frame, count + 1)
+        values = np.array([self.factor(paths, float(t))[0] for t in known]) / now
+        return np.asarray(np.interp(time, known, values))
+
+
+def _with_reflections(chain: np.ndarray, velocity: np.ndarray, mirror: np.ndarray) -> np.ndarray:
+    """Return velocities (K, B + 2, 3) with those of points of reflection (K, B + 2), where the
+    velocity given is that of the surface.
+
+    An end that moves along its ray leaves the point alone; the rest of its motion lies in the
+    surface and moves the point by the share of the other ray's length.
+    """
+    out = velocity.copy()
+    for k in np.tile(np.arange(1, chain.shape[1] - 1), SWEEPS):
+        rows = np.flatnonzero(mirror[:, k])
+        if not rows.size:
+            continue
+        rays = chain[rows, k] - chain[rows, k - 1], chain[rows, k + 1] - chain[rows, k]
+        lengths = [np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), TINY) for ray in rays]
+        into, on = (ray / length for ray, length in zip(rays, lengths, strict=True))
+        normal, surface = on - into, velocity[rows, k]
+        moved = np.zeros((len(rows), 3))
+        for side, ray, other in ((k - 1, into, lengths[1]), (k + 1, on, lengths[0])):
+            along = (ray * normal).sum(axis=1, keepdims=True)
+            relative = out[rows, side] - surface
+            off = (relative * normal).sum(axis=1, keepdims=True)
+            moved += (relative - ray * off / np.where(along == 0, np.inf, along)) * other
+        out[rows, k] = surface + moved / (lengths[0] + lengths[1])
+    return out
+
+
+def screen(
+    box: Box, part: Part, wavelength: float, reach: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rows of paths whose part passes a box (N,), and the heights of its edges, the
+    lower and the upper (N, 2) each in Fresnel units, level and across.
+
+    Parameters
+    ----------
+    reach : how much farther than its shadow reaches a box counts [m]
+    """
+    rows, starts, ends, before, total = part
+    centre, length = box.pose.position, np.linalg.norm(ends - starts, axis=1)
+    along, to = (ends - starts) / length[:, None], centre - starts
+    at = np.clip((to * along).sum(1), 0, length)
+    off = np.linalg.norm(to - at[:, None] * along, axis=1)
+    largest_unit = np.sqrt(wavelength * total / 8)
+    near = np.flatnonzero(off < np.linalg.norm(box.half) + LIT_REACH * largest_unit + reach)
+    corners = centre + (CORNERS * box.half) @ box.attitude.axes.T
+    up = vertical(along[near])
+    basis = np.stack([np.cross(along[near], up), along[near], up], axis=2)  # level, along, across
+    low, high = extent_between((corners - starts[near, None]) @ basis, length[near])
+    there = np.isfinite(low[:, 1])
+    near, low, high = near[there], low[there], high[there]
+    middle = before[near] + (low[:, 1] + high[:, 1]) / 2
+    unit = fresnel_unit(wavelength, middle, total[near] - middle)
+    unit = np.maximum(unit, TINY)[:, None]
+    return rows[near], low[:, ::2] / unit, high[:, ::2] / unit
+
+
+def extent_between(corners: np.ndarray, length: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and greatest coordinates (K, 3) of boxes, by their corners (K, 8, 3), where
+    the second coordinate is from 0 to `length` (K,); not finite where it never is."""
+    a, b = corners[:, EDGES[:, 0]], corners[:, EDGES[:, 1]]
+    rise = (b - a)[..., 1]
+    rise = np.where(rise == 0, TINY, rise)
+    with np.errstate(over="ignore"):  # to infinity, with the right sign
+        shares = -a[..., 1] / rise, (length[:, None] - a[..., 1]) / rise
+    first, last = np.minimum(*shares), np.maximum(*shares)
+    within = np.tile((first <= 1) & (last >= 0), (1, 2))[..., None]
+    cuts = [np.clip(share, 0, 1)[..., None] for share in (first, last)]
+    found = np.concatenate([a + cut * (b - a) for cut in cuts], axis=1)
+    low, high = np.where(within, found, np.inf), np.where(within, found, -np.inf)
+    return low.min(axis=1), high.max(axis=1)
