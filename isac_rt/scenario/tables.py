@@ -287,20 +287,45 @@ def by_aspect(unit: str) -> Reader:
 
     def read(path: Path) -> dict[str, Any]:
         c = read_csv(path, ("azimuth_deg", "elevation_deg", unit))
-        angles = list(zip(c["elevation_deg"], c["azimuth_deg"], strict=True))
-        values = dict(zip(angles, c[unit], strict=True))
-        rows, columns = sorted({e for e, _ in angles}), sorted({a for _, a in angles})
-        if len(values) != len(angles):
-            raise ValueError("holds a direction twice")
-        if len(values) != len(rows) * len(columns):
-            raise ValueError(
-                f"{len(values)} directions are no grid of {len(columns)} azimuths and {len(rows)} "
-                "elevations; add those that are missing"
-            )
-        table = [[values[e, a] for a in columns] for e in rows]
-        return {"table": {"azimuth_deg": columns, "elevation_deg": rows, "values_db": table}}
+        return {"table": _grid(c["azimuth_deg"], c["elevation_deg"], c[unit])}
 
     return read
+
+
+def _grid(azimuth: list[float], elevation: list[float], column: list[float]) -> dict[str, Any]:
+    """Return the table by aspect of rows in any order."""
+    angles = list(zip(elevation, azimuth, strict=True))
+    values = dict(zip(angles, column, strict=True))
+    rows, columns = sorted({e for e, _ in angles}), sorted({a for _, a in angles})
+    if len(values) != len(angles):
+        raise ValueError("holds a direction twice")
+    if len(values) != len(rows) * len(columns):
+        raise ValueError(
+            f"{len(values)} directions are no grid of {len(columns)} azimuths and {len(rows)} "
+            "elevations; add those that are missing"
+        )
+    table = [[values[e, a] for a in columns] for e in rows]
+    return {"azimuth_deg": columns, "elevation_deg": rows, "values_db": table}
+
+
+def _centres(path: Path) -> dict[str, Any]:
+    """Scattering centres: a row for each, or one for each direction of each."""
+    at, aspect = ("right_m", "ahead_m", "up_m"), ("azimuth_deg", "elevation_deg")
+    c = read_csv(path, (*at, "dbsm"), (*aspect, "phase_deg"))
+    places: dict[tuple[float, ...], list[int]] = {}
+    for row, place in enumerate(zip(*(c[name] for name in at), strict=True)):
+        places.setdefault(place, []).append(row)
+    out = []
+    for place, rows in places.items():
+        azimuth, elevation = (
+            [c[name][row] if name in c else 0.0 for row in rows] for name in aspect
+        )
+        centre: dict[str, Any] = {"position_m": list(place)}
+        for key, name in (("table", "dbsm"), ("phase_table", "phase_deg")):
+            if name in c:
+                centre[key] = _grid(azimuth, elevation, [c[name][row] for row in rows])
+        out.append(centre)
+    return {"centres": out}
 
 
 def _pattern(path: Path) -> dict[str, Any]:
@@ -321,6 +346,7 @@ def _tables_of(tree: dict[str, Any], folder: Path) -> Iterator[tuple[Key, str, R
         directed = isinstance(uav, dict) and uav.get("boresight", "velocity") != "velocity"
         yield ("swarm", name), "flight", partial(_flight, tree.get("city"), folder, directed)
         yield ("swarm", name, "rcs"), "file", by_aspect("dbsm")
+        yield ("swarm", name, "extent"), "file", _centres
 
 
 def with_tables(

@@ -33,6 +33,10 @@ RECORD_BYTES = 2e4
 PROGRAM_BYTES = 4e8
 """Interpreter, libraries and a small city, measured: 0.35 GB after the first frame of
 scenes/paper_swarm.yaml."""
+COPY_BYTES = 550
+"""Path to a point of a blade in one slot, with its tone; measured on scenes/quadcopter.yaml."""
+CHORD_POINTS = 5
+"""Points on the chord of a flat blade."""
 MOST_EPOCHS = 4_000
 ALIAS_EPOCHS = 50
 
@@ -58,7 +62,16 @@ def receivers_at_work() -> int:
     return (os.cpu_count() or 1) + 1
 
 
-def check_memory(arrays: Arrays, timetable: Timetable) -> None:
+def copies_needed(swarm: Swarm, waveform: Waveform) -> float:
+    """Return the number of paths to points of blades in a frame of a link: one point for each
+    quarter of a wavelength in each slot."""
+    metres = 0.0
+    for rotors in (uav.rotors for uav in swarm.uavs.values() if uav.rotors is not None):
+        metres += rotors.total_length * (1 if rotors.chord_m is None else CHORD_POINTS)
+    return 4 * metres / waveform.wavelength * waveform.num_chirps
+
+
+def check_memory(arrays: Arrays, timetable: Timetable, swarm: Swarm) -> None:
     """Refuse a run that exceeds the free memory.
 
     Raises
@@ -71,11 +84,14 @@ def check_memory(arrays: Arrays, timetable: Timetable) -> None:
         memory_needed(timetable.waveform, antennas, timetable.frames, links, at_work)
         for antennas in arrays
     )
+    copies = copies_needed(swarm, timetable.waveform) * COPY_BYTES * min(links, at_work)
+    needed += copies
     if free is not None and needed > free:
+        shorter = f", or shorten blades of rotors ({copies / 1e9:.3g} GB)" if copies else ""
         raise ScenarioError(
             f"the run would need about {needed / 1e9:.3g} GB of memory, {free / 1e9:.3g} GB are "
             "free; lower radio.samples_per_chirp, radio.chirps_per_frame, array.rx_x, array.rx_z "
-            "or frames"
+            f"or frames{shorter}"
         ) from MemoryError()
 
 

@@ -592,7 +592,7 @@ def planned(scenario: Scenario) -> Plan:
     arrays, swarm = arrays_of(scenario, waveform), swarm_of(scenario)
     schedule = schedule_of(scenario.schedule, waveform, generator(scenario.seed, "schedule"))
     timetable = timetable_of(scenario, waveform, schedule)
-    check_memory(arrays, timetable)
+    check_memory(arrays, timetable, swarm)
     check_flights(swarm, timetable)
     check_reference(scenario.noise, scenario.clutter, swarm, timetable)
     return plan_of(scenario, arrays, timetable, swarm)

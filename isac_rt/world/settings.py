@@ -299,12 +299,17 @@ class Rotors(Node):
         return math.hypot(inner, self.height_m)
 
     @property
+    def total_length(self) -> float:
+        """Length of all blades together [m]."""
+        return self.number * self.blades * self.blade_length_m
+
+    @property
     def tip_speed(self) -> float:
         """Speed of a blade's tip [m/s]."""
         return 2 * math.pi * self.rev_per_min / 60 * self.blade_length_m
 
     def problems(self) -> Iterator[Problem]:
-        if (total := self.number * self.blades * self.blade_length_m) > MOST_BLADES_M:
+        if (total := self.total_length) > MOST_BLADES_M:
             yield Problem(
                 (("number",), ("blades",), ("blade_length_m",)),
                 f"blades of {total:g} m together, at most {MOST_BLADES_M:g} m fit the memory; "
@@ -323,8 +328,16 @@ class Centre(Node):
 
     position_m: Vector
     """Position from the middle of the UAV: to the right, ahead, up [m]."""
-    value_dbsm: Decibels
-    """Cross-section, the same to all sides [dBsm]."""
+    value_dbsm: Decibels | None = None
+    """Cross-section, the same to all sides [dBsm]; in place of `table`."""
+    table: AspectTable | None = None
+    """Cross-section by azimuth and elevation of the bisector in the UAV's frame [dBsm]."""
+    phase_table: AspectTable | None = None
+    """Phase of the echo, a table as `table` [degrees, within +-400]. null, the default: 0."""
+
+    def problems(self) -> Iterator[Problem]:
+        if (self.value_dbsm is None) == (self.table is None):
+            yield Problem((("value_dbsm",), ("table",)), "a centre has one of both; state one")
 
 
 class Extent(Node):
@@ -339,12 +352,19 @@ class Extent(Node):
     1.5 x 1.6 x 0.7 (uav), 2 x 5 x 1.6 (vehicle), 1 x 0.5 x 0.5 (agv), 0.5 x 0.5 x 1.75."""
     centres: tuple[Centre, ...] = ()
     """Centres, for the kind `centres`. By default none."""
+    file: str | None = None
+    """CSV file in place of `centres`: right_m, ahead_m, up_m, dbsm, and optionally phase_deg,
+    azimuth_deg and elevation_deg; a row for each centre, or for each direction of each."""
 
     def applies(self, name: str) -> bool:
-        return name == "kind" or (name == "centres") == (self.kind == "centres")
+        return name == "kind" or (name == "size_m") != (self.kind == "centres")
 
     def problems(self) -> Iterator[Problem]:
-        if bool(self.centres) != (self.kind == "centres"):
+        if self.file is not None:
+            yield Problem(
+                (("file",),), "is read by isac_rt.load, which was not used; state centres"
+            )
+        elif bool(self.centres) != (self.kind == "centres"):
             text = "go with kind centres, and kind centres with them"
             yield Problem((("centres",), ("kind",)), text)
         if self.size_m is not None and self.kind == "centres":

@@ -208,8 +208,12 @@ class MovingCentres:
                     power = base.power * over_noise[link]
                     if 10 * np.log10(power) > level:
                         level, parts = 10 * np.log10(power), model.described(*base.towards)
-            error = 2 * np.pi * frequency * remainder(model.jerk, slot / 2)
-            left_out = "jerk and turning within pieces of the frame"
+            if level == -np.inf and Link(name, name) in found and name in self.own:
+                continue
+            error = (
+                2 * np.pi * frequency * remainder(model.jerk, slot / 2) + model.fading * slot / 2
+            )
+            left_out = "jerk, turning and obliquity within pieces of the frame"
             row = self._row(parts, model.speed, level, left_out, max(PHASE_ERROR, error))
             out.append({"what": f"moving parts of {name}", **row})
         for link, paths in found.items():

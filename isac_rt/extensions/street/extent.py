@@ -13,8 +13,9 @@ sum is coherent over frames. Centres lie in the middle of the faces.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -27,7 +28,9 @@ from isac_rt.propagation.rcs import (
     Lobe,
     lobe_db,
 )
-from isac_rt.world.settings import Extent, Rcs
+from isac_rt.settings import AspectTable
+from isac_rt.world.aspect import in_table
+from isac_rt.world.settings import Centre, Extent, Rcs
 
 
 class Kind(NamedTuple):
@@ -72,14 +75,21 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Fixed:
-    """Centres that rest in a target's axes, and the cross-section of each."""
+    """Centres that rest in a target's axes, and the cross-section of each.
+
+    Attributes
+    ----------
+    phases : tables of cosine and sine of the phase of those echoes that have any, by centre
+    """
 
     places: np.ndarray
-    sections: tuple[Section, ...]
+    sections: tuple[Callable[[np.ndarray, np.ndarray], Any], ...]
+    phases: Mapping[int, tuple[AspectTable, AspectTable]] = field(default_factory=dict)
 
     replaces_echo: ClassVar[bool] = True
     speed: ClassVar[float] = 0.0
     jerk: ClassVar[float] = 0.0
+    fading: ClassVar[float] = 0.0
 
     def described(self, *towards: np.ndarray) -> str:
         """Return the centres in words."""
@@ -88,12 +98,19 @@ class Fixed:
     def amplitudes(
         self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
     ) -> np.ndarray:
-        """(K,) square root of each centre's cross-section [m]."""
-        return np.sqrt([section(incident, observed) for section in self.sections])
+        """(K,) square root of each centre's cross-section [m], with its phase."""
+        sections = np.ravel([section(incident, observed) for section in self.sections])
+        out = np.sqrt(sections).astype(complex)
+        total = incident + observed
+        bisector = total / max(float(np.linalg.norm(total)), 1e-9)
+        for k, (cosine, sine) in self.phases.items():
+            phasor = in_table(cosine, bisector) + 1j * in_table(sine, bisector)
+            out[k] *= np.exp(1j * np.angle(phasor).item())
+        return out
 
     def mean_section(self, incident: np.ndarray, observed: np.ndarray) -> float:
         """Return the cross-section of all centres, added by power [m^2]."""
-        return sum(section(incident, observed) for section in self.sections)
+        return float(np.sum([section(incident, observed) for section in self.sections]))
 
     def motion(self, time: np.ndarray) -> Motion:
         """Return the centres' places, at rest."""
@@ -103,11 +120,11 @@ class Fixed:
 
 @dataclass(frozen=True)
 class Section:
-    """Cross-section of one centre: the same to all sides, or a lobe times a random field."""
+    """Cross-section of one centre: a lobe times a random field."""
 
     lobe: Lobe
     bistatic: tuple[float, float]
-    random: CrossSection | None = None
+    random: CrossSection
 
     def __call__(self, incident: np.ndarray, observed: np.ndarray) -> float:
         """Return the cross-section [m^2]."""
@@ -115,17 +132,13 @@ class Section:
         norm = float(np.linalg.norm(total))
         bisector, half = total / max(norm, 1e-9), np.arccos(np.clip(norm / 2, 0.0, 1.0))
         value = 10 ** (float(lobe_db(self.lobe, self.bistatic, bisector, half)) / 10)
-        return value * (
-            1.0 if self.random is None else float(self.random.square_metres(incident, observed))
-        )
+        return value * float(self.random.square_metres(incident, observed))
 
 
 def fixed_of(extent: Extent, seed: int, name: str) -> Fixed:
     """Return the centres of a target."""
     if extent.kind == "centres":
-        stated = [Lobe(None, np.inf, 0.0, np.inf, c.value_dbsm, 0.0) for c in extent.centres]
-        places = np.array([c.position_m for c in extent.centres])
-        return Fixed(places, tuple(Section(lobe, (0.0, 0.0)) for lobe in stated))
+        return stated(extent.centres)
     kind = KINDS[extent.kind]
     lobes = of_several(kind.lobes)
     random = Rcs(model="constant", value_dbsm=0.0, fluctuation_db=kind.std_db)
@@ -135,6 +148,25 @@ def fixed_of(extent: Extent, seed: int, name: str) -> Fixed:
     )
     size = np.array(extent.size_m or kind.size)
     return Fixed(np.array([_outward(lobe) for lobe in lobes]) * size / 2, tuple(sections))
+
+
+def stated(centres: Sequence[Centre]) -> Fixed:
+    """Return the centres of a scenario or a file."""
+    sections = (
+        Rcs(model="constant", value_dbsm=c.value_dbsm or 0.0)
+        if c.table is None
+        else Rcs(model="table", table=c.table)
+        for c in centres
+    )
+    phases = {}
+    for k, centre in enumerate(centres):
+        if (table := centre.phase_table) is not None:
+            angle = np.radians(table.values_db)
+            parts = (tuple(map(tuple, f(angle).tolist())) for f in (np.cos, np.sin))
+            cosine, sine = (table.model_copy(update={"values_db": part}) for part in parts)
+            phases[k] = cosine, sine
+    places = np.array([c.position_m for c in centres])
+    return Fixed(places, tuple(CrossSection(rcs, "", 0).square_metres for rcs in sections), phases)
 
 
 def of_several(lobes: tuple[Lobe, ...]) -> list[Lobe]:

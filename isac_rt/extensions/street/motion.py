@@ -26,6 +26,7 @@ class CentreModel(Protocol):
     Attributes
     ----------
     speed, jerk : largest of all centres against the body [m/s, m/s^3]
+    fading : largest rate at which amplitudes change [1/s of the largest]
     replaces_echo : the UAV's own point echo is left out
     """
 
@@ -36,6 +37,9 @@ class CentreModel(Protocol):
 
     @property
     def jerk(self) -> float: ...
+
+    @property
+    def fading(self) -> float: ...
 
     def described(self, *towards: np.ndarray) -> str:
         """Return what is modelled, in words for the plan, as seen from directions (3,)."""

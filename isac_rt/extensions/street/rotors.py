@@ -76,6 +76,11 @@ class Blades:
     replaces_echo: ClassVar[bool] = False
 
     @property
+    def fading(self) -> float:
+        """Rate at which amplitudes change: none [1/s]."""
+        return 0.0
+
+    @property
     def speed(self) -> float:
         """Speed of the fastest point [m/s]."""
         return float(np.abs(self.radius * self.turning).max())
@@ -130,6 +135,11 @@ class Plates(Blades):
     start: np.ndarray
     spin: np.ndarray
     lead: np.ndarray
+
+    @property
+    def fading(self) -> float:
+        """Largest rate at which the obliquity changes [1/s]."""
+        return float(np.abs(self.spin * np.sin(np.radians(self.rotors.incidence_deg))).max())
 
     def described(self, *towards: np.ndarray) -> str:
         """Return the blades in words."""

@@ -55,6 +55,7 @@ class Walker:
     section: float
 
     replaces_echo: ClassVar[bool] = True
+    fading: ClassVar[float] = 0.0
 
     @property
     def speed(self) -> float:
