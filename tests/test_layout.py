@@ -243,7 +243,7 @@ MAX_LINES = {
     "signal": 837,
     "receive": 6083,
     "track": 1949,
-    "scenario": 2170,
+    "scenario": 2172,
     "results": 3705,
     "simulation": 3760,
     "sweep": 2785,

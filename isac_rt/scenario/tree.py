@@ -174,14 +174,15 @@ class Scenario(Node):
         return None if self.radio.calibration is None else self.folder / self.radio.calibration
 
     def by_chirp(self) -> tuple[Scenario, ...]:
-        """The scenario as the radars of each chirp have it for themselves: their `radio` is that of
-        all, the other radars are targets, and emitters where their chirps sweep over the same
-        frequencies and send a stated power. The common chirp comes first; where all have it, this
-        very scenario is returned."""
+        """The scenario as the radars of each chirp and clock have it for themselves: their `radio`
+        is that of all, the other radars are targets, and emitters where their chirps sweep over the
+        same frequencies and send a stated power. The common chirp comes first; where all have it on
+        one clock, this very scenario is returned."""
         radars = [n for n, u in self.swarm.items() if u.role == "active"]
         if self.radio.mode != "fmcw" or not radars:
             return (self,)
-        chirps = [(self.radio, self.num_tx), *map(self._chirp_of, radars)]
+        timed = [self._chirp_of(name) for name in radars]
+        chirps = [(self.radio, self.num_tx, *timed[0][2:]), *timed]
         different = [c for i, c in enumerate(chirps) if c not in chirps[:i]]
         groups = [[n for n in radars if self._chirp_of(n) == chirp] for chirp in different]
         if len(groups[0]) == len(radars):
@@ -189,10 +190,11 @@ class Scenario(Node):
         parts = [self._alone(names) for names in groups if names]
         return tuple(part._among([one for one in parts if one is not part]) for part in parts)
 
-    def _chirp_of(self, name: str) -> tuple[Radio, int]:
-        """Return the radio and the number of transmit elements of a terminal."""
+    def _chirp_of(self, name: str) -> tuple[Radio, int, float, float]:
+        """Return the radio, the number of transmit elements, and the clock of a terminal."""
         uav = self.swarm[name]
-        return uav.radio or self.radio, (uav.array or self.array).num_tx
+        num_tx = (uav.array or self.array).num_tx
+        return uav.radio or self.radio, num_tx, uav.clock_offset_s, uav.clock_drift_ppm
 
     def _alone(self, names: Sequence[str]) -> Scenario:
         """Return the scenario of some radars of one chirp, the other radars as targets."""
@@ -266,7 +268,7 @@ class Scenario(Node):
         """P T-, the longest terminal's frame without the pause that `frame_interval_s` may leave
         after it."""
         radars = [name for name, uav in self.swarm.items() if uav.role == "active"]
-        chirps = [*map(self._chirp_of, radars)] or [(self.radio, self.num_tx)]
+        chirps = [self._chirp_of(name)[:2] for name in radars] or [(self.radio, self.num_tx)]
         return max(radio.chirps_per_frame * radio.times(num_tx).slot for radio, num_tx in chirps)
 
     @property

@@ -318,7 +318,7 @@ def warn_of_interference(
         f"{frame}{more}), both sweep {low:.5g} to {top:.5g} GHz; the run holds for radars on one "
         f"clock, whose chirps take turns {w.group_spacing * 1e6:.3g} us apart; on clocks of their "
         f"own they interfere, within the receiver's band at {share:.2g} % of the clock offsets; "
-        "turn or move one of them, or run each alone"
+        "give one a clock_offset_s, turn or move it, or run each alone"
     )
 
 

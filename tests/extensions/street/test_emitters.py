@@ -203,6 +203,29 @@ def test_radars_of_two_chirps_disturb_each_other():
     assert all(not part.foreign for part in elsewhere._by_chirp.values())
 
 
+@pytest.mark.filterwarnings("ignore::isac_rt.scenario.file.ScenarioWarning")
+def test_radars_of_one_chirp_on_two_clocks_disturb_each_other():
+    """B, which is 0.3 us late, is a tone of A's at the slope times that and the delay; on one clock
+    they take turns. Planted bug: the clock left out of what tells radars apart."""
+    late = 0.3e-6
+    swarm = {
+        name: {key: value for key, value in uav.items() if key not in ("radio", "clock_drift_ppm")}
+        for name, uav in TWO["swarm"].items()
+    }
+    for uav in swarm.values():
+        uav["clock_offset_s"] = 4e-6
+    assert not prepare(load({**TWO, "swarm": swarm})).by_chirp
+    swarm["B"]["clock_offset_s"] += late
+    setup = prepare(load({**TWO, "swarm": swarm}))
+    frame, part, link = setup.frame(3), setup.of("A"), ("A", "A")
+    extra = frame.samples(link).samples - replace(part.frame(3), foreign={}).samples(link).samples
+    poses = frame.poses
+    delay = np.linalg.norm(poses["B"].position - poses["A"].position) / SPEED_OF_LIGHT
+    beat = part.waveform.slope * (late + delay)
+    cells = np.abs(np.fft.fft(extra[0, 0, 0])).argmax()
+    assert cells == round(beat / part.waveform.sampling_rate * 256)
+
+
 def test_radars_of_chirps_shorter_than_any_that_is_stated_disturb_each_other():
     """What a radar sends is within its own limits. Planted bug: it checked as an emitter that a
     person states."""
