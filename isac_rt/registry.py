@@ -150,6 +150,7 @@ EXTENSIONS = {
     "map_files": "isac_rt.extensions.city_files.tables:table_files",
     "map_buildings": "isac_rt.extensions.city_files.footprints:footprints",
     "flight_log": "isac_rt.extensions.flights.logs:flight_log",
+    "traffic": "isac_rt.extensions.flights.traffic:traffic",
     "emitters": "isac_rt.extensions.street.emitters:Emitters",
     "emitters_plan": "isac_rt.extensions.street.emitters:plan_row",
     "with_foreign": "isac_rt.extensions.street.emitters:WithForeign",

@@ -222,6 +222,7 @@ def fake_records(scenario: Scenario, *, detections: int = 3) -> list[FrameRecord
                     target=np.array([2]),
                     uav=np.array([2 if see[2] else -1]),
                     false=np.array([not see[2]]),
+                    object=np.zeros(1, bool),
                 ),
                 state=int(f > 0),
                 gospa=Gospa(0.3, 0.09, 0.0, 12.5 * (not see[2])),

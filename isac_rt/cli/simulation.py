@@ -236,6 +236,8 @@ def _say_summary(results: Results) -> None:
             "tracks per frame",
             block["false_tracks"],
         )
+        if moving := block["object_tracks_per_frame"]:
+            say(f"{tables.link_words(name)}: {tables.number(moving)} tracks per frame of objects")
     out().print(tables.legend(*shown))
     outcomes = ", ".join(
         f"{n:,} {kind.replace('_', ' ')}" for kind, n in summary["paths"].items() if n

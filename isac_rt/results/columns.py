@@ -320,6 +320,11 @@ TRACKS: dict[str, Column] = {
     "false": _number(
         "confirmed, follows no UAV and is 5 m or more from every one", "tracks.false", bool
     ),
+    "object": _number(
+        "confirmed, follows no UAV, and is within 5 m of an object or fed by one",
+        "tracks.object",
+        bool,
+    ),
 }
 
 

@@ -47,6 +47,7 @@ class TrackTable:
         index of the UAV involved, -1: none
     uav : index of the UAV in view that it follows (`isac_rt.results.scoring`), -1: none
     false : confirmed, follows no UAV and is at least the cutoff of GOSPA from every one
+    object : confirmed, follows no UAV, and is near an object or fed by one
     """
 
     id: np.ndarray
@@ -61,6 +62,7 @@ class TrackTable:
     target: np.ndarray
     uav: np.ndarray
     false: np.ndarray
+    object: np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)

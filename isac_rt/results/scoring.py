@@ -45,6 +45,7 @@ from isac_rt.results.records import (
 )
 from isac_rt.track.parts import Late
 from isac_rt.track.tracker import TrackSet
+from isac_rt.world.settings import TERMINAL_ROLES
 from isac_rt.world.swarm import Pose, Swarm
 
 MISREAD = 0.5
@@ -89,6 +90,7 @@ class Scorer(Stateful):
         self._resolution = Resolution.of(timetable.waveform, antennas, self._passes)
         self._least = CramerRao.of(timetable.waveform, antennas, self._passes)
         self._receivers = receivers
+        self._objects = np.array([role == "object" for role in timetable.first_roles.values()])
         self.state = Remembered()
 
     def record(
@@ -115,9 +117,13 @@ class Scorer(Stateful):
         labels = self._labels_of(reception.detections, paths, sees, view.directions)
         reported = self._reported(frame)
         seen = np.isin(np.arange(len(view.truth)), list(view.seen))
-        confirmed = tracks.mean[tracks.confirmed, :3]
-        distance, false = score_tracks(confirmed, view.positions, seen & ~reported)
-        table, caused = self._table(view, tracks, labels, false)
+        causes = self._latest(tracks, labels)
+        places, scored = tracks.mean[tracks.confirmed, :3], seen & ~reported
+        distance, false = score_tracks(places, view.positions, scored)
+        moving = false & self._of_objects(causes)[tracks.confirmed]
+        if moving.any():
+            distance = score_tracks(places[~moving], view.positions, scored)[0]
+        table, caused = self._table(view, tracks, causes, (false, moving))
         symbols = SymbolCount()
         if self._passes == 1:
             symbols = count_symbols(sent.payload, reception, timetable.groups(self.link))
@@ -209,6 +215,7 @@ class Scorer(Stateful):
         inside = np.array(
             [name != rx and within_view(self._arrays, self.link, poses, name) for name in names]
         )
+        inside &= ~self._objects
         own_paths = owners(paths.kind, paths.target, paths, names)
         rows = np.flatnonzero(own_paths >= 0)
         rows = rows[~paths.select(rows).bent]
@@ -224,8 +231,8 @@ class Scorer(Stateful):
         """(U,) UAVs that are terminals in a frame and report their position; none in a swarm of
         terminals alone, whose terminals are its targets."""
         roles = [self._timetable.roles(frame), self._timetable.first_roles]
-        now, first = (np.array([role != "target" for role in of.values()]) for of in roles)
-        return now & ~first.all()
+        now, first = (np.isin([*of.values()], TERMINAL_ROLES) for of in roles)
+        return now & ~(first | self._objects).all()
 
     def _sensitivity(self, frame: int, sent: Transmission, noise_power: float) -> Sensitivity:
         timetable = self._timetable
@@ -269,7 +276,11 @@ class Scorer(Stateful):
         return best, hit
 
     def _table(
-        self, view: _View, tracks: TrackSet, labels: DetectionLabels, false: np.ndarray
+        self,
+        view: _View,
+        tracks: TrackSet,
+        causes: np.ndarray,
+        far: tuple[np.ndarray, np.ndarray],
     ) -> tuple[TrackTable, dict[int, int]]:
         """Return the tracks with what explains them and whom they follow, and the rows of those
         that follow the UAV whose own path explains their latest detection.
@@ -280,15 +291,11 @@ class Scorer(Stateful):
 
         Parameters
         ----------
-        false : of the confirmed tracks, those far from every UAV
+        causes : (T, 3) of `_latest`
+        far : of the confirmed tracks, those far from every UAV and object, and those of them that
+            objects feed
         """
-        columns = np.column_stack([labels.kind, labels.target, labels.uav])
-        for track, row in zip(tracks.ids.tolist(), tracks.detection.tolist(), strict=True):
-            if row >= 0:
-                self.state.labels[track] = columns[row].tolist()
-        mine = {track: self.state.labels.get(track, [-1, -1, -1]) for track in tracks.ids.tolist()}
-        self.state.labels = mine
-        kind, target, uav = np.array([*mine.values()], int).reshape(-1, 3).T
+        (false, moving), (kind, target, uav) = far, causes.T
         follows, rows = np.full(len(tracks), -1), np.flatnonzero(tracks.confirmed)
         off = np.full((len(view.seen), len(rows)), np.inf)
         for i, (u, truth) in enumerate(view.seen.items()):
@@ -302,8 +309,11 @@ class Scorer(Stateful):
             u, row = list(view.seen)[i], rows[k]
             follows[row], self.state.followed[u] = u, int(tracks.ids[row])
         first = {int(follows[k]): int(k) for k in rows if 0 <= follows[k] == uav[k]}
-        of_nobody = np.zeros(len(tracks), bool)
-        of_nobody[rows] = false & (follows[rows] < 0)
+        of_nobody, of_object = np.zeros((2, len(tracks)), bool)
+        places, nobody = tracks.mean[rows, None, :3], follows[rows] < 0
+        off = np.linalg.norm(places - view.positions[self._objects], axis=2)
+        of_nobody[rows] = false & ~moving & nobody
+        of_object[rows] = (moving | (off < GOSPA_CUTOFF_M).any(axis=1)) & nobody
         table = TrackTable(
             id=tracks.ids,
             range=tracks.range,
@@ -317,8 +327,27 @@ class Scorer(Stateful):
             target=target,
             uav=follows,
             false=of_nobody,
+            object=of_object,
         )
         return table, first
+
+    def _latest(self, tracks: TrackSet, labels: DetectionLabels) -> np.ndarray:
+        """Return kind, target and path's owner (T, 3) of the detection that fed each track last."""
+        columns = np.column_stack([labels.kind, labels.target, labels.uav])
+        for track, row in zip(tracks.ids.tolist(), tracks.detection.tolist(), strict=True):
+            if row >= 0:
+                self.state.labels[track] = columns[row].tolist()
+        mine = {track: self.state.labels.get(track, [-1, -1, -1]) for track in tracks.ids.tolist()}
+        self.state.labels = mine
+        return np.array([*mine.values()], int).reshape(-1, 3)
+
+    def _of_objects(self, causes: np.ndarray) -> np.ndarray:
+        """Mark the tracks (T,) that an object's own echo or its mirroring face feeds."""
+        kind, target, _ = causes.T
+        return (
+            np.isin(kind, (PathKind.TARGET, PathKind.SPECULAR))
+            & np.append(self._objects, False)[target]
+        )
 
     def _chances(
         self, view: _View, paths: PathSet, sees: Sensitivity, tx: Pose

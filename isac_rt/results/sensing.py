@@ -50,6 +50,7 @@ class Sensing:
     gospa : (F, 3) localisation, missed, false [m^2] of targets
     num_false, num_clutter : (F,) detections
     false_tracks : (F, kinds + 1) confirmed tracks far from every UAV, by `FALSE_CAUSES`
+    object_tracks : (F,) confirmed tracks of objects
     ghosts : (F, U) those of them that ghosts of each UAV feed
     """
 
@@ -70,6 +71,7 @@ class Sensing:
     num_false: np.ndarray
     num_clutter: np.ndarray
     false_tracks: np.ndarray
+    object_tracks: np.ndarray
     ghosts: np.ndarray
 
     @classmethod
@@ -120,6 +122,7 @@ class Sensing:
             np.array(values["num_false"]),
             np.array(values["num_clutter"]),
             counted(np.where(kind < 0, len(KINDS), kind), false, len(FALSE_CAUSES)),
+            np.bincount(frame, tracks["object"], count).astype(int),
             counted(ghost_of, ghost, num_uavs),
         )
 
@@ -147,6 +150,7 @@ class Sensing:
             "false_tracks": {
                 name: share(int(n), frames) for name, n in zip(FALSE_CAUSES, false, strict=True)
             },
+            "object_tracks_per_frame": share(int(self.object_tracks.sum()), frames),
             "cooperative": self._scores(self.cooperative),
         }
 

@@ -40,14 +40,14 @@ class Uav(settings.Uav):
 
     def applies(self, name: str) -> bool:
         if name in HARDWARE:
-            return self.role != "target"
+            return self.is_terminal
         return super().applies(name)
 
     def problems(self) -> Iterator[Problem]:
         yield from super().problems()
         for key in HARDWARE:
-            if getattr(self, key) is not None and self.role == "target":
-                message = "has no meaning for a target, which neither sends nor receives; remove it"
+            if getattr(self, key) is not None and not self.is_terminal:
+                message = "has no meaning for what neither sends nor receives; remove it"
                 yield Problem(((key,), ("role",)), message)
 
 

@@ -366,6 +366,7 @@ def with_tables(
     ------
     TableError  If a file is none, is not readable as a table, or numbers are stated beside it.
     """
+    tree = _with_traffic(tree, folder, faults)
     out = _with_board(tree, folder, (), faults)
     swarm = out.get("swarm")
     for name, uav in swarm.items() if isinstance(swarm, dict) else ():
@@ -394,6 +395,38 @@ def with_tables(
         del here[name]
         here.update(table)
     return out
+
+
+def _with_traffic(
+    tree: dict[str, Any], folder: Path, faults: list[Problem] | None
+) -> dict[str, Any]:
+    """A tree with each vehicle of FILE#* in place of the UAV that names it so."""
+    swarm, out = tree.get("swarm"), dict[str, Any]()
+    swarm = swarm if isinstance(swarm, dict) else {}
+    files = {
+        name: uav["flight"].partition("#*")
+        for name, uav in swarm.items()
+        if isinstance(uav, dict) and "#*" in str(uav.get("flight"))
+    }
+    for name, uav in swarm.items():
+        if name not in files:
+            out[name] = uav
+            continue
+        head, _, start = files[name]
+        try:
+            frames, interval = tree.get("frames", 100), tree.get("frame_interval_s")
+            if not all(isinstance(n, int | float) for n in (frames, interval)):
+                raise ValueError("all vehicles of a file need frame_interval_s; state it")
+            degrees = partial(_from_degrees, geo=_georeference(tree.get("city"), folder))
+            about = folder / head, start, frames * interval, degrees
+            found = extension("traffic")(uav, *about)
+            out.update({f"{name}_{key}": vehicle for key, vehicle in found.items()})
+        except ValueError as problem:
+            if faults is None:
+                raise TableError(("swarm", name, "flight"), str(problem)) from None
+            faults.append(Problem((("swarm", name, "flight"),), str(problem)))
+            out[name] = {key: value for key, value in uav.items() if key != "flight"}
+    return {**tree, "swarm": out} if files else tree
 
 
 def _with_board(

@@ -39,7 +39,7 @@ from isac_rt.scenario.swarm import HARDWARE, Uav, formations, unfolded
 from isac_rt.settings import Key, Name, Node, Positive, Problem, Seed, dotted
 from isac_rt.signal.settings import Accuracy
 from isac_rt.track.settings import Belief, Tracking
-from isac_rt.world.settings import City, Formation
+from isac_rt.world.settings import TERMINAL_ROLES, City, Formation
 
 _PARTS = {
     "clutter_detector": registry.DETECTORS,
@@ -201,7 +201,7 @@ class Scenario(Node):
         first, swarm = self.swarm[names[0]], dict[str, Uav]()
         for name, uav in self.swarm.items():
             hidden = ("sensor", "radio") if name in names or uav.role != "active" else HARDWARE
-            role = uav.role if name in names else "target"
+            role = uav.role if name in names or uav.role == "object" else "target"
             swarm[name] = uav.model_copy(update=dict.fromkeys(hidden) | {"role": role})
         shared = {"radio": first.radio or self.radio, "array": first.array or self.array}
         interval = self.frame_interval_s or self.frame_duration_s
@@ -639,7 +639,7 @@ class Scenario(Node):
         for name, uav in self.swarm.items():
             key = common if uav.front_end is None else ("swarm", name, "front_end")
             at: Key = ("array",) if uav.array is None else ("swarm", name, "array")
-            if uav.role != "target" and uav.radio is None:
+            if uav.is_terminal and uav.radio is None:
                 stated.append((key, self.front_end_of(name), at, uav.array or self.array))
         for key, one, at, array in stated:
             yield from self._element_problems((*key, "transmit"), one.transmit, at, self.num_tx)
@@ -816,7 +816,7 @@ def _with_presets(data: Any) -> Any:
 def _with_own_hardware(uav: Any, data: dict[str, Any]) -> Any:
     """Complete the radio, the array and the noise that a terminal states by those of its sensor or
     of all."""
-    if not isinstance(uav, dict) or uav.get("role") == "target":
+    if not isinstance(uav, dict) or uav.get("role") not in TERMINAL_ROLES:
         return uav
     out = with_sensor(uav)
     for key in ("noise",) if out.get("sensor") else ("radio", "array", "noise"):

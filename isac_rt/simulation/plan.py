@@ -167,7 +167,7 @@ class Plan:
         All points of a path of length L, and what blocks it, lie within L/2 of the middle between
         its ends, which is no farther from the position than the farther end. Motion during a frame
         is added. The field of view is not used: a second wall may lie outside it."""
-        terminals = [name for name, uav in self.swarm.uavs.items() if uav.role != "target"]
+        terminals = [name for name, uav in self.swarm.uavs.items() if uav.is_terminal]
         times = map(self.timetable.epoch, range(self.timetable.frames))
         poses = [self.swarm.poses(time) for time in times]
         farthest = max(

@@ -313,7 +313,7 @@ class Setup:
     def has_ideal_hardware(self) -> bool:
         """True if all front ends of the scenario are ideal."""
         s = self.scenario
-        return all(s.front_end_of(name).ideal for name, u in s.swarm.items() if u.role != "target")
+        return all(s.front_end_of(name).ideal for name, u in s.swarm.items() if u.is_terminal)
 
     @cached_property
     def front_ends(self) -> dict[str, Any]:
@@ -322,7 +322,7 @@ class Setup:
         return {
             name: make(s.front_end_of(name), self.waveform, self.arrays.of(name), s.seed, name)
             for name, uav in s.swarm.items()
-            if uav.role != "target"
+            if uav.is_terminal
         }
 
     @cached_property
@@ -812,7 +812,7 @@ def _connected(setup: Setup) -> Setup:
     clocks = {
         name: Clock(uav.clock_offset_s, uav.clock_drift_ppm * 1e-6)
         for name, uav in s.swarm.items()
-        if uav.role != "target" and s.access.synchronisation != "external"
+        if uav.is_terminal and s.access.synchronisation != "external"
     }
     if not s.access.establish:
         return replace(setup, connections=Connections(clocks))

@@ -41,6 +41,7 @@ from isac_rt.views.style import (
     words,
 )
 from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.settings import TERMINAL_ROLES
 
 _STEPS = 5
 """Steps of an axis at most: every tick takes as long to draw as a curve."""
@@ -70,7 +71,7 @@ def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Ax
         if u in boxes:
             ax.add_patch(footprint(boxes[u][-1], colour))
         facing = dataset.uav_attitude.values[-1, u, :2, 1]
-        if role != "target":
+        if role in TERMINAL_ROLES:
             ax.annotate(
                 "",
                 (x[-1] + 0.25 * margin * facing[0], y[-1] + 0.25 * margin * facing[1]),
@@ -79,7 +80,7 @@ def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Ax
             )
     for role, marker in ROLE_MARKERS.items():
         if role in dataset.role.values:
-            label = "target" if role == "target" else f"{role} terminal, boresight"
+            label = f"{role} terminal, boresight" if role in TERMINAL_ROLES else role
             ax.plot([], [], marker, color="#606060", label=label)
     ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
     ax.set_aspect("equal")

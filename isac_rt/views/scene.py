@@ -38,7 +38,12 @@ _MOST_OF_A_FRAME = 400
 """Paths of a kind that are drawn of a single frame, the strongest."""
 CREASE = np.deg2rad(20.0)
 """Faces that meet at more than this have an edge drawn between them [rad]."""
-ROLE_SYMBOLS = {"active": "diamond", "passive": "square", "target": "circle"}
+ROLE_SYMBOLS = {
+    "active": "diamond",
+    "passive": "square",
+    "target": "circle",
+    "object": "diamond-open",
+}
 _AXES = "xyz"
 BOX_FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 """Corners round each face of a box, its corners in the order of their signs along its axes."""

@@ -36,7 +36,7 @@ UAV_COLOURS = (
     "#000000",
     "#8C6D31",
 )
-ROLE_MARKERS = {"active": "*", "passive": "s", "target": "o"}
+ROLE_MARKERS = {"active": "*", "passive": "s", "target": "o", "object": "D"}
 STYLE: dict[Any, Any] = {
     "figure.dpi": 110,
     "font.size": 9,

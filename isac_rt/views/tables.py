@@ -356,20 +356,23 @@ def _traffic(fused: Mapping[str, Any], receives: bool) -> tuple[str, str, str]:
 
 
 def false_table(summary: Mapping[str, Any]) -> Table:
-    """Tabulate the false tracks per frame of each link by cause, without causes that do not occur;
-    no rows without false tracks."""
+    """Tabulate the false tracks per frame of each link by cause, without causes that do not occur,
+    and the tracks of objects, which are none; no rows without either."""
     links = {name: s for name, s in summary["links"].items() if "false_tracks" in s}
     causes = [c for c in FALSE_CAUSES if any(s["false_tracks"][c] for s in links.values())]
+    moving = {name: s.get("object_tracks_per_frame") for name, s in links.items()}
+    extra = ["Tracks of objects"] if any(moving.values()) else []
     rows = [
         (
             link_words(name),
             *map(number, (s["false_tracks_per_frame"], *map(s["false_tracks"].get, causes))),
+            *(number(moving[name]) for _ in extra),
         )
         for name, s in links.items()
-        if causes
+        if causes or extra
     ]
     titles = (cause.replace("_", " ").capitalize() for cause in causes)
-    return Table((_FALSE, "All", *titles), rows)
+    return Table((_FALSE, "All", *titles, *extra), rows)
 
 
 def _uavs(summary: Mapping[str, Any], group: str) -> Iterator[tuple[str, str, Mapping[str, Any]]]:

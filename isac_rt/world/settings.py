@@ -426,13 +426,18 @@ class Formation(Node):
         return out
 
 
+TERMINAL_ROLES = ("active", "passive")
+"""Roles of UAVs that send or receive."""
+
+
 class Uav(Node):
     """One UAV: its role, its flight and its body. It flies straight from `position_m`, or a smooth
     curve through `waypoints`."""
 
-    role: Literal["active", "passive", "target"]
+    role: Literal["active", "passive", "target", "object"]
     """What the UAV does: `active` sends the chirps and senses with their echoes, `passive` decodes
-    the data and senses with the chirps it receives, `target` only reflects."""
+    the data and senses with the chirps it receives, `target` only reflects; an `object`, such as a
+    car, reflects too, but is no target that is scored."""
     position_m: Vector | None = None
     """Position at the start of the run: x east, y north, z up [m]. A UAV has either this or
     `waypoints`."""
@@ -445,7 +450,7 @@ class Uav(Node):
     flight: str | None = None
     """File instead of `waypoints`, relative to the scenario's folder: CSV of time_s and x, y, z [m]
     or lat, lon, alt, optionally yaw_deg, pitch_deg, roll_deg; or a log (PX4, ROS 2, SUMO) as
-    FILE#PART@START. A final ~SECONDS smooths it."""
+    FILE#PART@START, or FILE#*@START for each vehicle of SUMO. A final ~SECONDS smooths it."""
     mount_deg: Vector = (0.0, 0.0, 0.0)
     """How the arrays are turned against the UAV's own frame: yaw to the right, pitch up, roll
     [degrees], as of a radar that looks sideways from a car. By default they look ahead."""
@@ -461,8 +466,8 @@ class Uav(Node):
     extent: Extent | None = None
     """Several scattering centres in place of one. null, the default: a point target."""
     box: Box | None = None
-    """Box that shadows other paths and mirrors them with its faces; for targets, in place of the
-    disc of `body_radius_m`. null, the default: none."""
+    """Box that shadows other paths and mirrors them with its faces; for targets and objects, in
+    place of the disc of `body_radius_m`. null, the default: none."""
     clock_offset_s: Finite = 0.0
     """How late the UAV's clock is at time 0 [s]: what it sends arrives later by this, what it
     receives seems to arrive earlier. By default all clocks agree."""
@@ -489,6 +494,11 @@ class Uav(Node):
             )
         return value
 
+    @property
+    def is_terminal(self) -> bool:
+        """True if it sends or receives at the start."""
+        return self.role in TERMINAL_ROLES
+
     def applies(self, name: str) -> bool:
         if name == "resource_block":
             return self.role == "active"
@@ -514,16 +524,10 @@ class Uav(Node):
         if any(turned) and self.boresight != "velocity":
             text = "the waypoints' attitude_deg says where the UAV looks; leave one of the two out"
             yield Problem((("boresight",), ("waypoints",)), text)
-        if self.box is not None and self.role != "target":
-            text = (
-                "is for targets: a terminal would sit within it; give it to a target, or remove it"
-            )
+        if self.box is not None and self.is_terminal:
+            text = "is for targets and objects: a terminal would sit within it; remove it"
             yield Problem((("box",), ("role",)), text)
-        if (
-            self.rotors is not None
-            and self.role != "target"
-            and self.rotors.nearest < NEAREST_BLADE_M
-        ):
+        if self.rotors is not None and self.is_terminal and self.rotors.nearest < NEAREST_BLADE_M:
             yield Problem(
                 (("rotors", "height_m"), ("rotors", "arm_m"), ("role",)),
                 f"the blades come to {self.rotors.nearest:.2g} m from the arrays of a terminal, at "

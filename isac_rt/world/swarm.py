@@ -208,7 +208,7 @@ class Swarm:
     @property
     def terminals(self) -> list[str]:
         """Names of the UAVs that send or receive."""
-        return [name for name, uav in self.uavs.items() if uav.role != "target"]
+        return [name for name, uav in self.uavs.items() if uav.is_terminal]
 
     @property
     def transmitters(self) -> list[str]:

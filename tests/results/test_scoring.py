@@ -341,6 +341,28 @@ def test_targets_are_scored_without_the_terminals():
     assert record.gospa[1:] == pytest.approx((4.09, 0.0, 0.0))
 
 
+def test_tracks_of_objects_are_named_and_not_false():
+    """U2 is a car: a track at its end, one 30 m off that its flash feeds, one as far that a wall
+    feeds, U1's own; it is no target in view. Planted bugs: the flash's track is false in GOSPA; all
+    tracks far from UAVs are the car's."""
+    roles = TIMETABLE.first_roles | {"U2": "object"}
+    street = replace(TIMETABLE, first_roles=roles)
+    judge = Scorer(Link("AT", "AT"), Arrays(ANTENNAS), SWARM, street, Receivers())
+    flash = path_of("AT", "U2", DATA, 3.0, PathKind.SPECULAR, (40.0, 0.0))
+    wall = path_of("AT", "U2", DATA, 3.0, PathKind.SPECULAR, (80.0, 0.0))
+    rows = [path_of("AT", "U1", DATA, 3.0), path_of("AT", "U2", DATA, 3.0), wall]
+    rows += [flash | {"target": NAMES.index("U2")}]
+    cells = np.array([W.range_cell(2), 0, 0, 0])
+    points = [seen_by("AT", "U2", DATA) + n * cells for n in (40, 80)]
+    tracks = [(1, True, -1, "U1", 0.3), (2, True, -1, "U2", 4.0)]
+    tracks += [(3, True, 0, "U2", 30.0), (4, True, 1, "U2", 31.0)]
+    record = scored(judge, DATA, rows, points, tracks)
+    assert record.tracks.object.tolist() == [False, True, True, False]
+    assert record.tracks.false.tolist() == [False, False, False, True]
+    assert record.gospa[1:] == pytest.approx((0.09, 0.0, 12.5))
+    assert record.uavs.in_view.tolist() == [True, False, True, False]
+
+
 def test_an_alias_or_a_drifted_track_does_not_stand_for_a_uav():
     """The own path explains them, more than three resolutions off: a velocity a period off, and a
     track that went astray; one in the gate is 6 m off across. Planted bugs: no gate; no cutoff."""

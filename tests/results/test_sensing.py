@@ -15,7 +15,7 @@ GOSPA = {f"gospa_{part}": 0.0 for part in ("localisation", "missed", "false")}
 
 def row(seen=(1, 1), errors=(None, None), tracks=(), **more):
     """One frame of two UAVs, targets: errors of detections (range, velocity, azimuth, elevation)
-    [SI, rad], tracks of (id, false, kind, target, followed UAV)."""
+    [SI, rad], tracks of (id, 1 if false and 2 if of an object, kind, target, followed UAV)."""
     seen = np.array(seen, bool)
     out = {"in_view": seen, "occluded": np.zeros(2, bool), "hit": np.zeros(2, bool)}
     out |= {"loss": np.where(seen, Loss.OTHER, -1), "num_false": 0, "num_clutter": 0, **GOSPA}
@@ -31,6 +31,7 @@ def row(seen=(1, 1), errors=(None, None), tracks=(), **more):
     }
     table = np.array(tracks, int).reshape(-1, 5)
     out["track"] = dict(zip(("id", "false", "kind", "target", "uav"), table.T, strict=True))
+    out["track"] |= {"false": table[:, 1] == 1, "object": table[:, 1] == 2}
     for k, name in enumerate(MEASURES):
         truth = np.array([17.3, -2.9])
         out[f"truth_{name}"] = truth
@@ -139,7 +140,7 @@ def test_gospa_is_the_root_of_its_parts():
 
 def test_false_tracks_by_cause():
     """A wall's, one of noise and two ghosts of UAV 1 are far from every UAV; a second track of UAV
-    0 is near it. Planted bug: all that follow nobody count."""
+    0 is near it, and a car has one. Planted bug: all that follow nobody count."""
     ghost, target = int(PathKind.GHOST), int(PathKind.TARGET)
     tracks = [
         (1, 0, target, 0, 0),
@@ -148,12 +149,14 @@ def test_false_tracks_by_cause():
         (5, 1, ghost, 1, -1),
         (6, 1, ghost, 1, -1),
         (7, 0, target, 0, -1),
+        (8, 2, target, 1, -1),
     ]
     s = sensing([row(tracks=tracks), row()])
     block = s.block()
     expected = {"diffuse": 0.5, "noise": 0.5, "ghost": 1.0}
     assert block["false_tracks"] == dict.fromkeys(FALSE_CAUSES, 0.0) | expected
     assert block["false_tracks_per_frame"] == pytest.approx(2.0)
+    assert block["object_tracks_per_frame"] == 0.5
     assert [t["ghost_tracks"] for t in s.targets(["U1", "U2"]).values()] == [0, 2]
 
 

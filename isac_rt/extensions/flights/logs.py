@@ -170,30 +170,61 @@ def _bag(file: Path, part: str) -> FlightLog:
     return FlightLog(topic, times, places, kinds[topic] == _FIX, attitudes=angles)
 
 
-def _sumo(file: Path, part: str) -> FlightLog:
-    """Read a vehicle or person of floating-car data: x, y [m] of the net, or longitude and latitude
-    where the file's first comment tells of --fcd-output.geo; times from the file's first step. A
-    document type is refused: its entities might grow without end."""
+@dataclass(frozen=True)
+class FloatingCars:
+    """Vehicles and persons of a file of SUMO.
+
+    Attributes
+    ----------
+    rows : time since the file's first step [s], x, y, z, course and slope [degrees] of each
+        (N, 6), NaN where there is none
+    ids, persons : of all, and of those that are persons
+    sizes : width, length and height [m] of those of which the file has them
+    step : of the file [s]
+    on_earth : x is longitude, y latitude
+    """
+
+    rows: dict[str, NDArray[np.float64]]
+    ids: frozenset[str]
+    persons: frozenset[str]
+    sizes: dict[str, tuple[float, float, float]]
+    step: float
+    on_earth: bool
+
+
+def floating_cars(file: Path, part: str) -> FloatingCars:
+    """Read a vehicle or person of floating-car data, or all of them (*): x, y [m] of the net, or
+    longitude and latitude where the file's first comment tells of --fcd-output.geo; sizes by the
+    attributes of vehicles or of their `vType`. A document type is refused: its entities might grow
+    without end."""
     parser = expat.ParserCreate()
-    names: set[str] = set()
+    ids: dict[str, str] = {}
+    types: dict[str, str] = {}
+    sizes: dict[str, tuple[float, float, float]] = {}
     steps: list[float] = []
-    rows: list[tuple[float, ...]] = []
+    rows: dict[str, list[tuple[float, ...]]] = {}
     on_earth: list[bool] = []
 
     def doctype(*_: Any) -> None:
         raise ValueError(f"line {parser.CurrentLineNumber}: a <!DOCTYPE> is not read; remove it")
 
     def start(tag: str, of: Mapping[str, str]) -> None:
-        def value(key: str) -> float:
+        def value(key: str, otherwise: float | None = None) -> float:
+            if otherwise is not None and key not in of:
+                return otherwise
             return number(of.get(key, ""), parser.CurrentLineNumber, key)
 
+        name = of.get("id", "")
         if tag == "timestep":
             steps.append(value("time"))
         elif tag in ("vehicle", "person") and steps:
-            names.add(of.get("id", ""))
-            if part in ("", of.get("id")):
-                z = value("z") if "z" in of else math.nan
-                rows.append((steps[-1] - steps[0], value("x"), value("y"), z))
+            ids[name], types[name] = tag, of.get("type", "")
+            if part in ("", "*", name):
+                place = value("x"), value("y"), value("z", math.nan)
+                turn = value("angle", math.nan), value("slope", math.nan)
+                rows.setdefault(name, []).append((steps[-1] - steps[0], *place, *turn))
+        if tag in ("vehicle", "vType") and {"width", "length", "height"} <= of.keys():
+            sizes[f"{tag} {name}"] = value("width"), value("length"), value("height")
 
     parser.StartDoctypeDeclHandler = doctype
     parser.StartElementHandler = start
@@ -203,10 +234,26 @@ def _sumo(file: Path, part: str) -> FlightLog:
             parser.ParseFile(opened)
     except expat.ExpatError as problem:
         raise ValueError(f"{problem}; run SUMO again") from None
-    name = _choose(part, list(names), "vehicle")
-    c = np.array(rows)
-    positions = np.nan_to_num(c[:, [2, 1, 3] if any(on_earth) else [1, 2, 3]])
-    return FlightLog(name, c[:, 0], positions, any(on_earth), bool(np.isnan(c[:, 3]).any()))
+    stated = {
+        name: sizes.get(f"vehicle {name}") or sizes.get(f"vType {types[name]}") for name in ids
+    }
+    return FloatingCars(
+        {name: np.array(of_one) for name, of_one in rows.items()},
+        frozenset(ids),
+        frozenset(name for name, tag in ids.items() if tag == "person"),
+        {name: size for name, size in stated.items() if size},
+        float(np.median(np.diff(steps))) if len(steps) > 1 else 0.0,
+        any(on_earth),
+    )
+
+
+def _sumo(file: Path, part: str) -> FlightLog:
+    """Read a vehicle or person of floating-car data."""
+    cars = floating_cars(file, part)
+    name = _choose(part, list(cars.ids), "vehicle")
+    c = cars.rows[name]
+    positions = np.nan_to_num(c[:, [2, 1, 3] if cars.on_earth else [1, 2, 3]])
+    return FlightLog(name, c[:, 0], positions, cars.on_earth, bool(np.isnan(c[:, 3]).any()))
 
 
 _READERS = {".ulg": _ulog, ".xml": _sumo, ".db3": _bag, ".mcap": _bag, ".bag": _bag}

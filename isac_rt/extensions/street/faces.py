@@ -119,7 +119,7 @@ class Mirrors:
 
     def between_terminals(self, state: LinkState) -> Iterator[PathSet]:
         """Yield the paths from end to end over one face each."""
-        for one in self._over_faces(state, ""):
+        for one in self._over_faces(state):
             ways = ScatterPaths.along(one.segments)
             gain = one.factor * friis_amplitude(self.free.wavelength, ways.length)
             gain = gain * state.elements(self.free.arrays, ways)
@@ -135,7 +135,7 @@ class Mirrors:
                 continue
             pose = poses[name]
             seen_from = {end: replace(state, start=poses[end], end=pose) for end in state.link}
-            over = {end: list(self._over_faces(way, name)) for end, way in seen_from.items()}
+            over = {end: list(self._over_faces(way)) for end, way in seen_from.items()}
             if any(over.values()):
                 every = [[*self._straight(seen_from[end]), *over[end]] for end in state.link]
                 for there, back in itertools.product(*every):
@@ -165,11 +165,9 @@ class Mirrors:
             segments = straight(state.start, *state.end.motion()[:, None])
             yield Stretch(segments, 1.0, np.zeros((0, 3)), np.zeros(0, int))
 
-    def _over_faces(self, state: LinkState, name: str) -> Iterator[Stretch]:
-        """Yield the segments from start to end over faces of all boxes but that of `name`."""
+    def _over_faces(self, state: LinkState) -> Iterator[Stretch]:
+        """Yield the segments from start to end over faces; the middle of a box is before none."""
         for box, axes in zip(self.boxes, self._axes, strict=True):
-            if box.name == name:
-                continue
             margin = margins(box, axes, (state.start, state.end), self._time)
             for axis, side in zip(*np.nonzero((margin > 0).any(axis=0)), strict=True):
                 one = self._stretch(state, box, int(axis), float(2 * side - 1))

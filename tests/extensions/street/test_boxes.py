@@ -66,8 +66,8 @@ def test_a_wall_that_speeds_up_has_its_rate_and_acceleration(link, yaw):
 
 @pytest.mark.parametrize("link", [LINK, OWN])
 def test_a_uav_in_a_side_echoes_by_the_radar_equation(link):
-    """Over the side before, behind and both; metal scatters a twentieth. Planted bugs: `to.length`
-    twice; the echo of the box itself."""
+    """Over the side before, behind and both; metal scatters a hundredth. Planted bugs: `to.length`
+    twice; no `factor` of either way."""
     swarm, model = stage_with_uav()
     over = echoes_over(swarm, model, 0.4, link)
     assert over.bounces.tolist() == [1, 1, 2]
