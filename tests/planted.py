@@ -347,6 +347,11 @@ OF_CASES = {
         "LEFT_OUT) + 1) // 2",
         "LEFT_OUT) + 1) // 3",
     ),
+    "flat blade of points": Bug(
+        "extensions/street/rotors.py",
+        "np.exp(-1j * y[..., None] * self.nodes)",
+        "np.exp(-1.05j * y[..., None] * self.nodes)",
+    ),
     "cross section of a vehicle and an agv": Bug(
         "extensions/street/extent.py",
         "Lobe(180.0, 36.32, 79.65, 36.73, 14.56, 7.50)",

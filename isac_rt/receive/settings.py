@@ -81,8 +81,8 @@ class Receivers(Node):
     range cells, which passive terminals leave out of the symbol decision."""
     clutter_detector: Annotated[str, DETECTORS] = "cfar"
     """Test of an active terminal's cells. `cfar`, the default: against the cells around.
-    `angle_doppler`: all antennas coherently towards every direction, whitened by the clutter
-    covariance that mesh and own motion predict."""
+    `comb_cfar`: also against all velocities of their range, which rotors fill. `angle_doppler`: all
+    antennas coherently towards every direction, whitened by the predicted clutter."""
     passive_detector: Annotated[str, PASSIVE_DETECTORS] = "cfar"
     """Test of a passive terminal's cells. `cfar`, the default: against the cells around. `beams`:
     all antennas coherently towards every direction after removal of strong paths, whitened by the

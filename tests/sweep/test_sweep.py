@@ -107,7 +107,7 @@ def test_points_hold_the_axes_and_the_spawned_seeds(folder):
 
 
 @pytest.mark.parametrize(
-    "name", ["canyon_power", "clutter", "front_ends", "own_sensor", "receivers"]
+    "name", ["canyon_power", "clutter", "front_ends", "own_sensor", "receivers", "rotors"]
 )
 def test_every_entry_of_the_examples_fits_its_scene(name):
     """`load_sweep` tries each on the base scenario; a point is what it says."""

@@ -1,0 +1,48 @@
+r"""CFAR that knows combs: the lines of rotors, folded by the slots, fill all velocities of a UAV's
+range cells.
+
+The greatest-of CFAR compares a cell with the range cells before and behind it, where the comb is
+not. Here the background is at least the median over all velocities of the cell's own range,
+which a few targets do not move. Of Gamma(L)/L, the power of L channels in noise, the median is m
+and the mean 1: the median over m estimates the mean of noise and comb, and the factor of the
+false-alarm rate holds as for noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from isac_rt.receive.cfar import CfarRule
+from isac_rt.receive.estimate import Estimator
+from isac_rt.receive.known import Known
+from isac_rt.receive.sense import Cfar
+from isac_rt.receive.settings import Receivers
+
+
+@dataclass(frozen=True)
+class CombRule(CfarRule):
+    """Greatest-of CFAR before and behind a cell in range, and over all velocities of its range."""
+
+    def background(self, power: np.ndarray, keep: np.ndarray) -> np.ndarray:
+        """Return the background of each cell (rows, P)."""
+        median = np.median(power, axis=1, keepdims=True) * self.looks
+        over_velocities = median / gammaincinv(self.looks, 0.5)
+        return np.maximum(super().background(power, keep), over_velocities)
+
+
+@dataclass(frozen=True)
+class CombCfar(Cfar):
+    """CFAR by `CombRule`."""
+
+    def rule(self, known: Known) -> CfarRule:
+        """Return the rule of a frame."""
+        rule = super().rule(known)
+        return CombRule(rule.rate, rule.guard, rule.training, rule.looks)
+
+
+def comb_cfar(settings: Receivers, estimator: Estimator) -> Cfar:
+    """Return the detector, with the Doppler processing of the schedule."""
+    return CombCfar(settings, estimator)
