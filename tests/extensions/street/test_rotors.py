@@ -442,6 +442,23 @@ def test_own_blades_are_the_sum_over_points_at_every_sample(one_place):
     assert bound / 10 < error < bound < 0.05
 
 
+def test_the_plan_says_what_nobody_receives():
+    """A sole radar's own extent, and its rotors, which it receives itself. Planted bug: without
+    `and name in self.own`."""
+    centres = [{"position_m": [0, 1, 0], "value_dbsm": 0}]
+    flight = {"position_m": [1.0, 6.0, 1.5], "rcs": {"model": "constant"}}
+    extent = {"extent": {"kind": "centres", "centres": centres}}
+    for parts, lines in (
+        (extent, {"moving parts of radar": "without effect: no terminal"}),
+        ({"rotors": {"height_m": 0.1}}, {"own rotors of radar": "dB over the noise"}),
+    ):
+        setup = irt.prepare(scene(flight, 12, **parts))
+        rows = setup.moving_centres.report(*setup.find(0)[::-1], {OWN: 1.0})
+        stated = {row["what"]: row["modelled"] for row in rows}
+        assert stated.keys() == lines.keys()
+        assert all(words in stated[what] for what, words in lines.items())
+
+
 def test_blades_far_below_noise_are_left_out():
     """Planted bug: `<` for `>` in `with_centres`."""
     setup = irt.prepare(scenario(rotors={}))
