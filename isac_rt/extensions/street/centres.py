@@ -200,27 +200,27 @@ class MovingCentres:
         slot = w.chirp_duration + (w.num_groups - 1) * w.group_spacing - w.window_start
         frequency = w.carrier_frequency + w.bandwidth
         for name, model in self.models:
-            level, parts = -np.inf, model.described()
+            most, parts = 0.0, model.described()
             for link, paths in found.items():
                 which = _echoing(paths) == name
                 of = name, model, self._attitude(name, paths.epoch)
                 for base in self._bases(paths, which, poses, of):
                     power = base.power * over_noise[link]
-                    if 10 * np.log10(power) > level:
-                        level, parts = 10 * np.log10(power), model.described(*base.towards)
-            if level == -np.inf and Link(name, name) in found and name in self.own:
+                    if power > most:
+                        most, parts = power, model.described(*base.towards)
+            if not most and Link(name, name) in found and name in self.own:
                 continue
             error = (
                 2 * np.pi * frequency * remainder(model.jerk, slot / 2) + model.fading * slot / 2
             )
             left_out = "jerk, turning and obliquity within pieces of the frame"
-            row = self._row(parts, model.speed, level, left_out, max(PHASE_ERROR, error))
+            row = self._row(parts, model.speed, most, left_out, max(PHASE_ERROR, error))
             out.append({"what": f"moving parts of {name}", **row})
         for link, paths in found.items():
             own = self.own_echoes(paths, poses, 0.0)
             if own is not None:
                 blades, gain = self.own[link.tx], own.gain.real.reshape(w.num_chirps, -1)
-                level = 10 * np.log10(own.power.sum() / w.num_chirps * over_noise[link])
+                mean = float(own.power.sum()) / w.num_chirps * over_noise[link]
                 antennas = self.arrays.of(link.tx)
                 ends = antennas.rx_positions, antennas.tx_positions
                 reach = sum(float(np.linalg.norm(end, axis=1).max()) for end in ends)
@@ -229,21 +229,22 @@ class MovingCentres:
                 # the other change of a slot is in gain: by spreading and the elements' pattern
                 error += np.linalg.norm(np.diff(gain, axis=0)) / np.linalg.norm(gain) / 2
                 left_out = "directions and ranges within a slot"
-                row = self._row(blades.described(), blades.speed, level, left_out, float(error))
+                row = self._row(blades.described(), blades.speed, mean, left_out, float(error))
                 out.append({"what": f"own rotors of {link.tx}", **row})
         return out
 
     def _row(
-        self, parts: str, speed: float, level: float, left_out: str, error: float
+        self, parts: str, speed: float, power: float, left_out: str, error: float
     ) -> dict[str, Any]:
-        """Return what the plan says of moving parts, by their speed [m/s], their level over the
-        noise [dB] and the error of what is left out [rad]."""
+        """Return what the plan says of moving parts, by their speed [m/s], their power over the
+        noise of a cell and the error of what is left out [rad]."""
         edge, widest = 2 * speed / self.waveform.wavelength, 1 / (2 * self.waveform.slot_duration)
-        seen = (
-            f"{level:.0f} dB over the noise of a cell; Doppler to {edge:.4g} Hz either side, slots "
-            f"show {widest:.4g} Hz"
-        )
-        seen = seen if np.isfinite(level) else "without effect: no terminal receives its echo"
+        seen = "without effect: no terminal receives its echo"
+        if power > 0:
+            seen = (
+                f"{10 * np.log10(power):.0f} dB over the noise of a cell; Doppler to {edge:.4g} Hz "
+                f"either side, slots show {widest:.4g} Hz"
+            )
         return {
             "modelled": f"{parts}, {seen}",
             "left_out": left_out,

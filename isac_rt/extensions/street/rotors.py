@@ -48,6 +48,8 @@ LEFT_OUT = 1e-5
 """Amplitude that the sum of points may miss of a flash."""
 CHORD_LEFT_OUT = 1e-3
 """Amplitude that the points of a chord may miss, a tenth of what pieces miss of the obliquity."""
+DARK = 1e-10
+"""Power of a plate over that of its edges from which on it is called dark."""
 ANGLES = 8
 """Angles of a blade in each lobe of its pattern at which mean powers are summed."""
 PLASTIC = ((np.sqrt(3.0) - 1) / (np.sqrt(3.0) + 1)) ** 2
@@ -150,8 +152,8 @@ class Plates(Blades):
         wires = r.model_copy(update={"chord_m": None, "blade_dbsm": None})
         lobes = self.wave_number * r.blade_length_m / np.pi
         edges = blades * blade_section(wires) / (2 * lobes)  # mean of a sinc squared over a turn
-        ratio = 10 * np.log10(self.mean_section(*towards) / edges)
-        return f"{out}, {ratio:+.0f} dB against their edges as wires"
+        ratio = self.mean_section(*towards) / edges
+        return f"{out}, {10 * np.log10(max(ratio, DARK)):+.0f} dB against their edges as wires"
 
     def amplitudes(
         self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
@@ -226,8 +228,8 @@ def blades_of(rotors: Rotors, waveform: Waveform, seed: int, name: str) -> Blade
 def chord_nodes(rotors: Rotors, waveform: Waveform) -> np.ndarray:
     """Return the points of a chord, as parts of half its length; of a wire the one in its middle.
 
-    Between the points the phase differs from that in the middle of a piece by the blade's turn
-    within it (two thirds of `PHASE_ERROR` along the blade, or half a slot), and over the band.
+    Within a piece a blade turns by half a slot, or by as much as keeps `PHASE_ERROR` along it; that
+    and the band are what the phase on the chord changes by.
     """
     r, w = rotors, waveform
     if r.chord_m is None:
