@@ -113,7 +113,7 @@ def blade_of_points() -> Errors:
 
 
 @case(
-    "physical optics of a plate: two sincs and the mean obliquity of both polarisations",
+    "physical optics of a plate: two sincs and the mean obliquity",
     "1e-3 of a flash",
     "bound of the number of points on the chord",
 )
