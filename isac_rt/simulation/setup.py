@@ -201,13 +201,12 @@ class Frame:
         """
         s = self._setup
         least /= s.plan.cell_noise_gain(paths.tx) / s.waveform.num_chirps  # of one chirp
-        shadow = None
-        if s.boxes is not None:
-            shadow = s.boxes.shadows(paths, self.poses).over_time
+        shadows = None if s.boxes is None else s.boxes.shadows(paths, self.poses)
         if s.moving_centres is not None:
+            shadow = None if shadows is None else shadows.over_frame(paths)
             paths = s.moving_centres.with_centres(paths, self.poses, when, least, shadow)
-        if s.boxes is not None:
-            paths = s.boxes.in_pieces(paths, self.poses, when - paths.epoch, least)
+        if shadows is not None:
+            paths = shadows.in_pieces(paths, s.waveform, when - paths.epoch, least)
         return paths
 
     def _listening(self, link: Link) -> tuple[ReceiveArray, Reference]:

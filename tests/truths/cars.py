@@ -161,7 +161,7 @@ def sliding_shadows() -> Errors:
     swarm, model = stage(wall, **ends)
     paths = paths_at(swarm, model, 0.0)
     line = paths.select(paths.kind == PathKind.LINE_OF_SIGHT)
-    pieces = model.in_pieces(line, swarm.poses(0.0), 0.0, 0.0)
+    pieces = model.shadows(line, swarm.poses(0.0)).in_pieces(line, WAVEFORM, 0.0, 0.0)
     unit = np.sqrt(WAVELENGTH * 20 * 20 / (2 * 40))
     for t in CHIRPS:
         alive = (pieces.begin <= t) & (t < pieces.end)

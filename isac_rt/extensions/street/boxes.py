@@ -78,8 +78,8 @@ class Boxes:
             state = LinkState(link, epoch, poses[link.tx], poses[link.rx], paths.target_names)
             over = mirrors.between_terminals(state), mirrors.echoes(state, poses)
             every = merge([paths, *itertools.chain(*over)])
-            factor = self.shadows(every, poses).factor(every)
-            out[link] = replace(every, gain=every.gain * factor)
+            about = mirrors.boxes, state, poses, self._free.wavelength, half_frame
+            out[link] = replace(every, gain=every.gain * Shadows(*about).factor(every))
         return Traced(out, dropped)
 
     def shadows(self, paths: PathSet, poses: dict[str, Pose]) -> Shadows:
@@ -102,14 +102,6 @@ class Boxes:
             )
             for name, shape in self._shapes.items()
         ]
-
-    def in_pieces(
-        self, paths: PathSet, poses: dict[str, Pose], later: float, least_power: float
-    ) -> PathSet:
-        """Return a link's paths over `least_power` cut where their shadows change, in a frame whose
-        middle is `later` than the epoch [s]."""
-        shadows = self.shadows(paths, poses)
-        return shadows.in_pieces(paths, self._waveform, later, least_power)
 
     def report(
         self, frames: Sequence[tuple[dict[str, Pose], Mapping[Link, PathSet]]]

@@ -91,7 +91,7 @@ class MovingCentres:
         poses: Mapping[str, Pose],
         middle: float,
         least_power: float = 0.0,
-        shadow: Callable[[PathSet, np.ndarray], np.ndarray] | None = None,
+        shadow: Callable[[int, np.ndarray], np.ndarray] | None = None,
     ) -> PathSet:
         """Return a link's paths with those over centres, piece by piece of the frame.
 
@@ -100,8 +100,7 @@ class MovingCentres:
         poses : at the paths' epoch
         middle : of the receiver's frame [s]
         least_power : |gain|^2 of all centres together that a path over them must exceed
-        shadow : factor of a path's amplitude at times [s since the epoch], in a frame in which it
-            changes
+        shadow : factor of the amplitude of a path, by its row, at times [s since the epoch]
         """
         target = _echoing(paths)
         gives_way = [name for name, model in self.models if model.replaces_echo]
@@ -117,7 +116,7 @@ class MovingCentres:
                 for base in bases:
                     amplitudes = model.amplitudes(*base.towards, paths.epoch + time)
                     if shadow is not None:
-                        amplitudes = amplitudes * shadow(base.path, time)[:, None]
+                        amplitudes = amplitudes * shadow(base.row, time)[:, None]
                     parts.append(_copies(base, amplitudes, offset, begin, time))
         own = self.own_echoes(paths, poses, later)
         if own is not None and (own.power.sum() > least_power * self.waveform.num_chirps):
@@ -142,7 +141,7 @@ class MovingCentres:
             towards = images[0].towards @ attitude.axes, images[1].towards @ attitude.axes
             gain = path.gain / np.sqrt(section)
             power = float(np.abs(gain[0]) ** 2 * model.mean_section(*towards))
-            out.append(Base(path, *images, towards, gain, power))
+            out.append(Base(int(row), path, *images, towards, gain, power))
         return out
 
     def own_echoes(self, paths: PathSet, poses: Mapping[str, Pose], later: float) -> PathSet | None:
@@ -359,7 +358,7 @@ class EndImage(NamedTuple):
 
 
 class Base(NamedTuple):
-    """A path of a UAV and its ends as the UAV sees them.
+    """A path of a UAV, by its row, and its ends as the UAV sees them.
 
     Attributes
     ----------
@@ -368,6 +367,7 @@ class Base(NamedTuple):
     power : |gain|^2 of all centres together
     """
 
+    row: int
     path: PathSet
     sent: EndImage
     received: EndImage

@@ -109,7 +109,7 @@ class Shadows:
 
     def _parts(self, paths: PathSet, chain: np.ndarray, box: Box) -> Iterator[Part]:
         """Yield the straight parts that a box may shadow, the first of all paths first."""
-        placed = np.isfinite(paths.points).any(axis=(1, 2)) | (paths.kind == PathKind.LINE_OF_SIGHT)
+        placed = placed_paths(paths)
         own = (paths.target == box.number) | (paths.faces == FIRST_BOX - box.number).any(axis=1)
         lengths = np.linalg.norm(np.diff(chain, axis=1), axis=2)
         before, total = np.cumsum(lengths, axis=1) - lengths, lengths.sum(axis=1)
@@ -139,33 +139,62 @@ class Shadows:
             chain[:, k] = np.where(missing, chain[:, k + 1], chain[:, k])
         return chain, _with_reflections(chain, velocity, mirror)
 
+    def over_frame(self, paths: PathSet) -> OverFrame:
+        """Return the factors of paths over those at the epoch, in the frame."""
+        counts = self.counts(paths)
+        some = paths.select(counts > 1)
+        now = self.factor(some)
+        time = np.linspace(-self.half_frame, self.half_frame, counts.max(initial=1) + 1)
+        values = [self.factor(some, t) / np.where(now == 0, 1, now) for t in time.tolist()]
+        return OverFrame(counts, time, np.array(values))
+
     def in_pieces(
         self, paths: PathSet, waveform: Waveform, later: float, least_power: float
     ) -> PathSet:
         """Return paths over `least_power` cut where their shadows change, in a frame whose middle
         is `later` than the epoch [s]."""
-        counts = np.where(paths.power > least_power, self.counts(paths), 1)
-        slots = np.maximum(waveform.num_chirps // counts, 1)
-        now, parts = self.factor(paths), [paths.select(counts == 1)]
-        for each in np.unique(slots[counts > 1]):
-            rows = np.flatnonzero((slots == each) & (counts > 1) & (now != 0))
-            some = paths.select(rows)
-            begin, time = pieces(waveform, int(each), later)
-            for k, t in enumerate(time):
-                gain = some.gain * self.factor(some, float(t)) / now[rows]
-                lives = np.maximum(some.begin, begin[k]), np.minimum(some.end, begin[k + 1])
-                piece = replace(some, gain=gain, begin=lives[0], end=lives[1])
-                parts.append(piece.select(lives[0] < lives[1]))
+        placed = placed_paths(paths) & (paths.power > least_power)
+        some, rest = paths.select(placed), paths.select(~placed)
+        changing = self.over_frame(some)
+        parts = [rest, some.select(changing.counts == 1)]
+        for row in np.flatnonzero(changing.counts > 1).tolist():
+            slots = max(waveform.num_chirps // int(changing.counts[row]), 1)
+            begin, time = pieces(waveform, slots, later)
+            path = some.select(np.full(time.size, row))
+            lives = np.maximum(path.begin, begin[:-1]), np.minimum(path.end, begin[1:])
+            gain = path.gain * changing(row, time)
+            piece = replace(path, gain=gain, begin=lives[0], end=lives[1])
+            parts.append(piece.select(lives[0] < lives[1]))
         return merge(parts)
 
-    def over_time(self, paths: PathSet, time: np.ndarray) -> np.ndarray:
-        """Return the factor of one path at times (T,) over that at the epoch."""
-        count = int(self.counts(paths)[0])
-        if count == 1 or not (now := self.factor(paths)[0]):
-            return np.ones(len(time))
-        known = np.linspace(-self.half_frame, self.half_frame, count + 1)
-        values = np.array([self.factor(paths, float(t))[0] for t in known]) / now
-        return np.asarray(np.interp(time, known, values))
+
+@dataclass(frozen=True)
+class OverFrame:
+    """Factors of paths within a frame, over those at the epoch.
+
+    Attributes
+    ----------
+    counts : (K,) pieces that each path needs
+    time : (T,) [s since the epoch]
+    values : (T, C) of the paths that need more than one, linear between times
+    """
+
+    counts: np.ndarray
+    time: np.ndarray
+    values: np.ndarray
+
+    def __call__(self, row: int, time: np.ndarray) -> np.ndarray:
+        """Return the factors of a path at times (N,)."""
+        if self.counts[row] == 1:
+            return np.ones(time.size)
+        column = int((self.counts[:row] > 1).sum())
+        return np.asarray(np.interp(time, self.time, self.values[:, column]))
+
+
+def placed_paths(paths: PathSet) -> np.ndarray:
+    """Mark the paths (K,) whose way is known: not statistical clutter, leakage or moving parts."""
+    known = np.isfinite(paths.points).any(axis=(1, 2))
+    return np.asarray(known | (paths.kind == PathKind.LINE_OF_SIGHT))
 
 
 def _with_reflections(chain: np.ndarray, velocity: np.ndarray, mirror: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from truths.cars import (
 import isac_rt as irt
 from isac_rt.document import ScenarioError
 from isac_rt.extensions.street.boxes import Boxes
-from isac_rt.extensions.street.shadows import _with_reflections
+from isac_rt.extensions.street.shadows import STEP, _with_reflections
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.free_space import FreeSpace
 from isac_rt.propagation.pathset import PathKind
@@ -281,3 +281,28 @@ def test_the_plan_counts_what_boxes_do(traffic):
     (row,) = setup.boxes.report(frames)
     assert row["modelled"].startswith("3 paths a frame shadowed")
     assert row["modelled"].endswith("0.5 over faces")
+
+
+def test_limbs_fade_as_the_path_to_them(traffic):
+    """In a frame in which the car's edge passes before the pedestrian: the factor at each piece,
+    of the pedestrian's own path. Planted bugs: the row of another path; the frame's middle in all
+    pieces."""
+    frame, when = traffic.frame(8), traffic.timetable.epoch(8)
+    paths, moving = frame.paths["radar", "radar"], traffic.moving_centres
+    shadows = traffic.boxes.shadows(paths, frame.poses)
+    plain, faded = (
+        moving.with_centres(paths, frame.poses, when, 0.0, shadow)
+        for shadow in (None, shadows.over_frame(paths))
+    )
+    walker = paths.target_names.index("pedestrian")
+    own = np.flatnonzero((paths.target == walker) & (paths.kind == PathKind.TARGET))
+    of_walker = (plain.target == walker) & (plain.kind == PathKind.TARGET)
+    begin = np.unique(plain.begin[of_walker])
+    assert len(begin) > 4
+    for first in begin[[1, len(begin) // 2, -2]]:
+        row = np.flatnonzero(of_walker & (plain.begin == first))[0]
+        t = (first + plain.end[row]) / 2
+        path = paths.select(own)
+        ratio, now = faded.gain[row] / plain.gain[row], shadows.factor(path)[0]
+        assert abs(ratio * now - shadows.factor(path, t)[0]) < STEP
+    assert np.ptp(np.abs(faded.gain[of_walker] / plain.gain[of_walker])) > 0.3
