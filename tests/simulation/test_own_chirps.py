@@ -209,7 +209,7 @@ def test_different_chirps_in_one_band_of_unknown_power_are_doubted():
             "is isac, and radio.mode of all terminals is fmcw",
         ),
         ("A", {"radio": {"scheme": "simo"}}, "swarm.A.radio.scheme.*simo sends from one antenna"),
-        ("U", {"sensor": "awr1843"}, "swarm.U.sensor.*has no meaning for a target"),
+        ("U", {"sensor": "awr1843"}, "swarm.U.sensor.*has no meaning for what neither"),
         ("A", {"sensor": "awr9"}, "swarm.A.sensor = awr9: must be awr1642"),
         ("A", {"sensor": "gone.cfg"}, "swarm.A.sensor.*gone.cfg: cannot be read"),
         ("A", {"radio": {"calibration": "gone.nc"}}, "swarm.A.radio.calibration.*no such file"),

@@ -154,7 +154,7 @@ def test_elements_of_a_common_front_end_fit_every_array():
         ({"array": {"tx_x": 3}}, "4 transmit elements, and array has 3"),
         ({"array": {"schedule": "conventional"}}, "share array.schedule"),
         ({"noise": {"model": "snr"}}, "share noise.model"),
-        ({"role": "target"}, "has no meaning for a target"),
+        ({"role": "target"}, "has no meaning for what neither"),
     ],
 )
 def test_what_the_scheme_shares_cannot_differ(uav, said):
