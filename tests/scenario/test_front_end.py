@@ -64,7 +64,7 @@ def test_elements_are_those_of_the_array_that_is_stated(rx, count):
 
 def test_targets_have_no_front_end():
     """Planted bug: `problems` of a UAV without those of its hardware."""
-    with pytest.raises(ValidationError, match="no meaning for a target"):
+    with pytest.raises(ValidationError, match="no meaning for what neither"):
         Scenario(swarm=SWARM | {"U": {"role": "target", "position_m": [9, 9, 9], "front_end": {}}})
 
 
