@@ -247,7 +247,7 @@ MAX_LINES = {
     "results": 3745,
     "simulation": 3760,
     "sweep": 2785,
-    "views": 3669,
+    "views": 3677,
     "cli": 2315,
     "extensions": 15734,
 }

@@ -56,8 +56,9 @@ _UNITS = {
 def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Axes:
     """The swarm from above: tracks, final positions by role, boxes there, over the city's upward
     faces shaded by height."""
-    position = dataset.uav_position.values
-    low, high = position[..., :2].min((0, 1)), position[..., :2].max((0, 1))
+    position, scored = dataset.uav_position.values, dataset.role.values != "object"
+    shown = position[:, scored, :2]
+    low, high = shown.min((0, 1)), shown.max((0, 1))
     margin = 0.35 * max(*(high - low), 40.0)
     if city is not None and city.num_faces:
         _footprints(ax, city, low - margin, high + margin)
@@ -66,7 +67,7 @@ def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Ax
         x, y = position[:, u, 0], position[:, u, 1]
         role, colour = str(dataset.role.values[u]), colour_of(u)
         ax.plot(x, y, color=colour)
-        size = 11 if role == "active" else 6
+        size = {"active": 11, "object": 3}.get(role, 6)
         ax.plot(x[-1], y[-1], ROLE_MARKERS[role], color=colour, ms=size, mec="white", mew=0.8)
         if u in boxes:
             ax.add_patch(footprint(boxes[u][-1], colour))
@@ -86,7 +87,8 @@ def scene_map(ax: Axes, dataset: xr.Dataset, city: CityMesh | None = None) -> Ax
     ax.set_aspect("equal")
     ax.grid(False)
     labelled(ax, "east [m]", "north [m]")
-    _name(ax, position[-1, :, :2], [str(name) for name in dataset.uav.values])
+    names = {u: str(dataset.uav.values[u]) for u in np.flatnonzero(scored).tolist()}
+    _name(ax, position[-1, scored, :2], names)
     return ax
 
 
@@ -107,15 +109,16 @@ _BESIDE = np.array(
 """Places of a name around its marker, the best first [letters]."""
 
 
-def _name(ax: Axes, points: np.ndarray, names: Sequence[str]) -> None:
-    """Write names next to points (N, 2), each where it covers no other name and no marker."""
+def _name(ax: Axes, points: np.ndarray, names: Mapping[int, str]) -> None:
+    """Write names, by the UAV's index, next to points (N, 2), each where it covers no other name
+    and no marker."""
     figure = ax.get_figure(root=True)
     assert figure is not None
     figure.draw_without_rendering()  # the layout decides where the points lie
     markers = ax.transData.transform(points)
     letter, placed = matplotlib.rcParams["font.size"] * figure.dpi / 72, list[Bbox]()
     style = {"fc": "white", "ec": "none", "alpha": 0.7, "boxstyle": "round,pad=0.1"}
-    for u, (name, here) in enumerate(zip(names, markers, strict=True)):
+    for u, name, point, here in zip(names, names.values(), points, markers, strict=True):
         size = np.array([0.8 * len(name), 1.2]) * letter
         corners = here + 0.8 * letter * _BESIDE - size * (1 - np.sign(_BESIDE)) / 2
         boxes = [Bbox([corner, corner + size]) for corner in corners]
@@ -129,7 +132,7 @@ def _name(ax: Axes, points: np.ndarray, names: Sequence[str]) -> None:
         placed.append((free or boxes)[0])
         ax.annotate(
             name,
-            points[u],
+            point,
             xytext=(placed[u].p0 - here) * 72 / figure.dpi,
             textcoords="offset points",
             fontweight="bold",

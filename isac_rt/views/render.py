@@ -268,9 +268,11 @@ class _Picture:
             self.line(np.array([track.pose(t).position for t in times]), colour, 2.2)
             foot = self.view.project(np.stack([here, [here[0], here[1], below(here)]]))
             self.ax.plot(foot[:, 0], foot[:, 1], ":", color="#404040", lw=0.8, alpha=0.7)
-            big, edge = 15 if uav.role == "active" else 8, "white"
+            big, edge = {"active": 15, "object": 4}.get(uav.role, 8), "white"
             x, y = foot[0, :2]
             self.ax.plot(x, y, marker, color=colour, ms=big, mec=edge, mew=1.1, zorder=8)
+            if uav.role == "object":
+                continue
             self.ax.annotate(
                 name,
                 (x, y),
@@ -298,7 +300,9 @@ def view_scene(
 ) -> Figure:
     """The city, the swarm at `time` with its tracks over `times` [s], and the `paths` of that
     moment."""
-    tracks = np.array([[pose.position for pose in swarm.poses(t).values()] for t in times])
+    scored = [name for name, uav in swarm.uavs.items() if uav.role != "object"]
+    poses = [swarm.poses(t) for t in times]
+    tracks = np.array([[of[name].position for name in scored] for of in poses])
     view = best_view(city, tracks, width / height)
     image, depth = shade(city, view, width * _SUPERSAMPLING, height * _SUPERSAMPLING)
     image = image.reshape(height, _SUPERSAMPLING, width, _SUPERSAMPLING, 3).mean(axis=(1, 3))

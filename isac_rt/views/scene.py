@@ -140,7 +140,8 @@ def _uavs(names: Sequence[str], roles: Sequence[str], positions: np.ndarray) -> 
         "symbol": [ROLE_SYMBOLS[role] for role in roles],
     }
     kind = {"type": "scatter3d", "mode": "markers+text", "name": "UAVs"}
-    return {**kind, "text": list(names), "marker": marker, **points_of(positions)}
+    shown = ["" if role == "object" else n for n, role in zip(names, roles, strict=True)]
+    return {**kind, "text": shown, "marker": marker, **points_of(positions)}
 
 
 def boxes_in(dataset: xr.Dataset) -> dict[int, np.ndarray]:

@@ -436,8 +436,8 @@ class Uav(Node):
 
     role: Literal["active", "passive", "target", "object"]
     """What the UAV does: `active` sends the chirps and senses with their echoes, `passive` decodes
-    the data and senses with the chirps it receives, `target` only reflects; an `object`, such as a
-    car, reflects too, but is no target that is scored."""
+    the data and senses with the chirps it receives, `target` only reflects, as does an `object`, such
+    as a car, which is not scored."""
     position_m: Vector | None = None
     """Position at the start of the run: x east, y north, z up [m]. A UAV has either this or
     `waypoints`."""

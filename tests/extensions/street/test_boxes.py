@@ -3,6 +3,7 @@ integrals at each instant."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -288,7 +289,8 @@ def test_limbs_fade_as_the_path_to_them(traffic):
     of the pedestrian's own path. Planted bugs: the row of another path; the frame's middle in all
     pieces."""
     frame, when = traffic.frame(8), traffic.timetable.epoch(8)
-    paths, moving = frame.paths["radar", "radar"], traffic.moving_centres
+    paths, every = frame.paths["radar", "radar"], traffic.moving_centres
+    moving = replace(every, models=[m for m in every.models if m[0] == "pedestrian"])
     shadows = traffic.boxes.shadows(paths, frame.poses)
     plain, faded = (
         moving.with_centres(paths, frame.poses, when, 0.0, shadow)
