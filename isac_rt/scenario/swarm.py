@@ -47,7 +47,7 @@ class Uav(settings.Uav):
         yield from super().problems()
         for key in HARDWARE:
             if getattr(self, key) is not None and not self.is_terminal:
-                message = "has no meaning for a target or object, which has no radio; remove it"
+                message = "has no meaning for what neither sends nor receives; remove it"
                 yield Problem(((key,), ("role",)), message)
 
 

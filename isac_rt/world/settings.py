@@ -436,8 +436,8 @@ class Uav(Node):
 
     role: Literal["active", "passive", "target", "object"]
     """What the UAV does: `active` sends the chirps and senses with their echoes, `passive` decodes
-    the data and senses with the chirps it receives, `target` only reflects, as does an `object`, such
-    as a car, which is not scored."""
+    the data and senses with the chirps it receives, `target` only reflects, as does an `object`,
+    such as a car, which is not scored."""
     position_m: Vector | None = None
     """Position at the start of the run: x east, y north, z up [m]. A UAV has either this or
     `waypoints`."""
@@ -448,9 +448,9 @@ class Uav(Node):
     """Two places or more with their times, which the UAV flies through on a smooth curve; in place
     of `position_m` and `velocity_mps`."""
     flight: str | None = None
-    """File instead of `waypoints`, relative to the scenario's folder: CSV of time_s and x, y, z [m]
-    or lat, lon, alt, optionally yaw_deg, pitch_deg, roll_deg; or a log (PX4, ROS 2, SUMO) as
-    FILE#PART@START, or FILE#*@START for each vehicle of SUMO. A final ~SECONDS smooths it."""
+    """File instead of `waypoints`, in the scenario's folder: CSV of time_s and x, y, z [m] or lat,
+    lon, alt, optionally yaw_deg, pitch_deg, roll_deg; or a log (PX4, ROS 2, SUMO): FILE#PART@START,
+    SUMO's whole traffic FILE#*. ~SECONDS smooths."""
     mount_deg: Vector = (0.0, 0.0, 0.0)
     """How the arrays are turned against the UAV's own frame: yaw to the right, pitch up, roll
     [degrees], as of a radar that looks sideways from a car. By default they look ahead."""
