@@ -308,3 +308,14 @@ def test_limbs_fade_as_the_path_to_them(traffic):
         ratio, now = faded.gain[row] / plain.gain[row], shadows.factor(path)[0]
         assert abs(ratio * now - shadows.factor(path, t)[0]) < STEP
     assert np.ptp(np.abs(faded.gain[of_walker] / plain.gain[of_walker])) > 0.3
+
+
+@pytest.mark.slow
+def test_the_street_has_its_numbers():
+    """One seed of the scene: the pedestrian is found where the car does not hide it, and the car's
+    tracks are its own and not false."""
+    figures = irt.run(irt.load(SCENES / "street_traffic.yaml"), snapshots=0).summary["links"]
+    radar = figures["radar->radar"]
+    assert radar["in_view"] == 20 and 0.45 <= radar["hit_rate"] <= 0.65
+    assert 3 < radar["object_tracks_per_frame"] < 7
+    assert radar["false_tracks_per_frame"] < 0.7
