@@ -55,7 +55,7 @@ class PathSet:
     target_names : names that `target` indexes
     points : (K, B, 3) interaction points in world coordinates, NaN where there is none (a UAV's own
         position, and shadow edges round which a path bends, included)
-    faces : (K, B) int32 face of the city mesh at each point, -1 where there is none
+    faces : (K, B) int32 face of the city mesh at each point, -1 without one, -2 - n on UAV n's box
 
     Examples
     --------

@@ -109,7 +109,7 @@ OBSERVERS: dict[str, Column] = {
         )
         for name, (units, _) in MEASURES.items()
     },
-    "in_view": _of_uavs("UAV inside the field of view", "in_view", bool, 0),
+    "in_view": _of_uavs("UAV inside the field of view, no object", "in_view", bool, 0),
     "occluded": _of_uavs("UAV occluded by the city", "occluded", bool, 0),
     "hit": _of_uavs(
         "UAV found by its own path within one resolution on all four axes", "hit", bool, 0
@@ -438,7 +438,7 @@ PATHS: dict[str, Column] = {
         np.nan,
     ),
     "faces": _number(
-        "face of the city mesh at each point, -1 where there is none",
+        "face of the city mesh at each point, -1 where there is none, -2 - n on the box of UAV n",
         "faces",
         np.int32,
         dims=("bounce",),
