@@ -193,10 +193,10 @@ class FloatingCars:
 
 
 def floating_cars(file: Path, part: str) -> FloatingCars:
-    """Read a vehicle or person of floating-car data, or all of them (*): x, y [m] of the net, or
-    longitude and latitude where the file's first comment tells of --fcd-output.geo; sizes by the
-    attributes of vehicles or of their `vType`. A document type is refused: its entities might grow
-    without end."""
+    """Read a vehicle or person of floating-car data, or all that ride in no vehicle (*): x, y [m] of
+    the net, or longitude and latitude where the file's first comment tells of --fcd-output.geo;
+    sizes by the attributes of vehicles or of their `vType`. A document type is refused: its
+    entities might grow without end."""
     parser = expat.ParserCreate()
     ids: dict[str, str] = {}
     types: dict[str, str] = {}
@@ -204,6 +204,7 @@ def floating_cars(file: Path, part: str) -> FloatingCars:
     steps: list[float] = []
     rows: dict[str, list[tuple[float, ...]]] = {}
     on_earth: list[bool] = []
+    within: list[str] = []
 
     def doctype(*_: Any) -> None:
         raise ValueError(f"line {parser.CurrentLineNumber}: a <!DOCTYPE> is not read; remove it")
@@ -214,10 +215,11 @@ def floating_cars(file: Path, part: str) -> FloatingCars:
                 return otherwise
             return number(of.get(key, ""), parser.CurrentLineNumber, key)
 
-        name = of.get("id", "")
+        name, rides = of.get("id", ""), tag == "person" and "vehicle" in within
+        within.append(tag)
         if tag == "timestep":
             steps.append(value("time"))
-        elif tag in ("vehicle", "person") and steps:
+        elif tag in ("vehicle", "person") and steps and not (rides and part == "*"):
             ids[name], types[name] = tag, of.get("type", "")
             if part in ("", "*", name):
                 place = value("x"), value("y"), value("z", math.nan)
@@ -228,6 +230,7 @@ def floating_cars(file: Path, part: str) -> FloatingCars:
 
     parser.StartDoctypeDeclHandler = doctype
     parser.StartElementHandler = start
+    parser.EndElementHandler = lambda _: within.pop()
     parser.CommentHandler = lambda text: on_earth.append('fcd-output.geo value="true"' in text)
     try:
         with file.open("rb") as opened:

@@ -30,8 +30,8 @@ def bumper(name, t):
 
 
 def fcd(folder, more=""):
-    """A bus whose type has a size, a car of none, a van with its own, which departs at 3.05 s, a
-    person who waits, and a truck that has left before the run."""
+    """A bus whose type has a size, with a rider, a car of none, a van with its own, which departs
+    at 3.05 s, a person who waits, and a truck that has left before the run."""
     lines = ['<fcd-export><vType id="coach" width="2.5" length="12" height="3.4"/>', more]
     for t in np.arange(0, 6.01, 0.1):
         lines.append(f'<timestep time="{50 + t:.2f}">')
@@ -41,7 +41,8 @@ def fcd(folder, more=""):
             about = own if name != "car:1" else 'type="unknown"'
             where = f'x="{x:.9f}" y="{y:.9f}" z="{z}" angle="{np.degrees(turn):.9f}"'
             if name != "van" or t > 3.04:
-                lines.append(f'<vehicle id="{name}" {about} {where} slope="0"/>')
+                rider = f'<person id="r" {where}/>' if name == "bus" else ""
+                lines.append(f'<vehicle id="{name}" {about} {where} slope="0">{rider}</vehicle>')
         if t < 1:
             lines.append(f'<vehicle id="truck" x="{t}" y="0" angle="0"/>')
         lines += ['<person id="p" x="3" y="4" z="0.2" angle="90"/>', "</timestep>"]
@@ -52,7 +53,8 @@ def fcd(folder, more=""):
 
 def test_every_vehicle_is_a_box_behind_its_bumper(tmp_path, caplog):
     """Corners between the steps, at the run's time 0 of which the file shows 2 s. Planted bugs: the
-    bumper for the middle; courses counted from east; sizes of the entry for all; START ignored."""
+    bumper for the middle; courses counted from east; sizes of the entry for all; START ignored;
+    the rider walks."""
     with caplog.at_level("INFO", "isac_rt.inputs"):
         scenario = load(fcd(tmp_path))
     assert list(scenario.swarm) == ["R", "street_bus", "street_car_1", "street_p", "street_van"]
