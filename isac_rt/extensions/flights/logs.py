@@ -193,10 +193,11 @@ class FloatingCars:
 
 
 def floating_cars(file: Path, part: str) -> FloatingCars:
-    """Read a vehicle or person of floating-car data, or all that ride in no vehicle (*): x, y [m] of
-    the net, or longitude and latitude where the file's first comment tells of --fcd-output.geo;
-    sizes by the attributes of vehicles or of their `vType`. A document type is refused: its
-    entities might grow without end."""
+    """Read a vehicle or person of floating-car data, or all that ride in no vehicle (*).
+
+    Places are x, y [m] of the net, or longitude and latitude where the file's first comment tells
+    of --fcd-output.geo; sizes are attributes of vehicles or of their `vType`. A document type is
+    refused: its entities might grow without end."""
     parser = expat.ParserCreate()
     ids: dict[str, str] = {}
     types: dict[str, str] = {}
