@@ -161,6 +161,7 @@ EXTENSIONS = {
     "weather": "isac_rt.extensions.street.weather:Weathered",
     "weather_plan": "isac_rt.extensions.street.weather:plan_rows",
     "antenna_pattern": "isac_rt.extensions.antenna_files.patterns:antenna_pattern",
+    "points_of_rotors": "isac_rt.extensions.street.rotors:points_of",
     "moving_centres": "isac_rt.extensions.street.centres:moving_centres",
     "map_georeference": "isac_rt.extensions.city_files.footprints:located",
 }

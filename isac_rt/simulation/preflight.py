@@ -17,6 +17,7 @@ from isac_rt.frame.settings import Noise
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.settings import Clutter
+from isac_rt.registry import extension
 from isac_rt.runtime import available_memory
 from isac_rt.scenario.tree import NEAREST_M
 from isac_rt.simulation.coverage import Coverage, Outside, unambiguous_velocity
@@ -35,8 +36,6 @@ PROGRAM_BYTES = 4e8
 scenes/paper_swarm.yaml."""
 COPY_BYTES = 550
 """Path to a point of a blade in one slot, with its tone; measured on scenes/quadcopter.yaml."""
-CHORD_POINTS = 5
-"""Points on the chord of a flat blade."""
 MOST_EPOCHS = 4_000
 ALIAS_EPOCHS = 50
 
@@ -62,13 +61,13 @@ def receivers_at_work() -> int:
     return (os.cpu_count() or 1) + 1
 
 
-def copies_needed(swarm: Swarm, waveform: Waveform) -> float:
-    """Return the number of paths to points of blades in a frame of a link: one point for each
-    quarter of a wavelength in each slot."""
-    metres = 0.0
-    for rotors in (uav.rotors for uav in swarm.uavs.values() if uav.rotors is not None):
-        metres += rotors.total_length * (1 if rotors.chord_m is None else CHORD_POINTS)
-    return 4 * metres / waveform.wavelength * waveform.num_chirps
+def copies_needed(swarm: Swarm, waveform: Waveform) -> int:
+    """Return the number of paths to points of blades in a frame of a link with one path to each
+    UAV: one for each point in each slot."""
+    with_rotors = [uav.rotors for uav in swarm.uavs.values() if uav.rotors is not None]
+    return waveform.num_chirps * sum(
+        extension("points_of_rotors")(rotors, waveform) for rotors in with_rotors
+    )
 
 
 def check_memory(arrays: Arrays, timetable: Timetable, swarm: Swarm) -> None:
@@ -336,8 +335,8 @@ def warn_of_other_chirps(waveforms: Mapping[str, Waveform]) -> None:
     ]
     if pairs:
         _warn(
-            f"{', '.join(pairs)} sweep over the same frequencies with different chirps; the run "
-            "leaves out that they interfere, for noise.model snr knows no power; take link_budget"
+            f"{', '.join(pairs)} sweep over the same frequencies with different chirps or clocks; the "
+            "run leaves out that they interfere, for noise.model snr knows no power; take link_budget"
         )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from isac_rt.extensions.city_receivers import angle_doppler, bistatic
+from isac_rt.extensions.city_receivers import adaptive, angle_doppler, bistatic
 from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.scenario.file import load
@@ -69,7 +69,7 @@ class Counter:
             rows = np.arange(max(i - ROWS, 0), min(i + ROWS + 1, len(held)))
             bins = np.arange(w.num_chirps) if whole else np.arange(-BINS, BINS + 1)
             beside[np.ix_(rows, (bins + j) % w.num_chirps)] = True
-        kind = np.where(held > bistatic.LEAST, CLUTTER, QUIET)
+        kind = np.where(held > adaptive.LEAST_CLUTTER, CLUTTER, QUIET)
         kind[beside] = -1
         kind[:2] = -1
         d = heard.reception.detections.select(~heard.reception.detections.is_reference)

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from isac_rt.extensions.street.extent import fixed_of
 from isac_rt.extensions.street.motion import PHASE_ERROR, CentreModel, Motion, pieces
-from isac_rt.extensions.street.rotors import Blades, blades_of
+from isac_rt.extensions.street.rotors import Blades, as_wires, blades_of
 from isac_rt.extensions.street.walker import walker_of_flight
 from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.link import Link
@@ -61,8 +61,7 @@ def moving_centres(
             models.append((name, fixed_of(uav.extent, seed, name)))
         if uav.rotors is not None:
             models.append((name, blades_of(uav.rotors, waveform, seed, name)))
-            wires = uav.rotors.model_copy(update={"chord_m": None})
-            own[name] = blades_of(wires, waveform, seed, name)
+            own[name] = blades_of(as_wires(uav.rotors), waveform, seed, name)
     return MovingCentres(swarm, sections, waveform, arrays, models, own)
 
 
@@ -154,7 +153,7 @@ class MovingCentres:
         if not paths.link.own or paths.tx not in self.own:
             return None
         name, model = paths.tx, self.own[paths.tx]
-        begin, time = self.pieces(1 if model.speed else self.waveform.num_chirps, later)
+        begin, time = self.pieces(1, later)
         axes = body_axes(self.swarm, name, paths.epoch)
         motion = Motion(*(m @ axes.T for m in model.motion(paths.epoch + time)))
         distance, rate, accel = _distance(motion)
@@ -169,6 +168,9 @@ class MovingCentres:
             **dict.fromkeys(("departure", "arrival"), towards),
             **dict.fromkeys(("tx_radius", "rx_radius"), distance),
         }
+        received = columns["gain"].any(axis=0)
+        if not received.any():
+            return None
         at_arrays = make_paths(
             tx=name,
             rx=name,
@@ -180,7 +182,6 @@ class MovingCentres:
             departure=[axes[1]],
             arrival=[axes[1]],
         )
-        received = columns["gain"].any(axis=0)
         return _pieces(at_arrays, columns, begin, time).select(np.tile(received, time.size))
 
     def report(
@@ -199,7 +200,7 @@ class MovingCentres:
         slot = w.chirp_duration + (w.num_groups - 1) * w.group_spacing - w.window_start
         frequency = w.carrier_frequency + w.bandwidth
         for name, model in self.models:
-            most, parts = 0.0, model.described()
+            most, parts, half = 0.0, model.described(), slot / 2
             for link, paths in found.items():
                 which = _echoing(paths) == name
                 of = name, model, self._attitude(name, paths.epoch)
@@ -207,10 +208,12 @@ class MovingCentres:
                     power = base.power * over_noise[link]
                     if power > most:
                         most, parts = power, model.described(*base.towards)
+                        beyond = (self._slots_of_piece(paths, poses, of) - 1) * w.slot_duration
+                        half = (slot + beyond) / 2
             if not most and Link(name, name) in found and name in self.own:
                 continue
             error = (
-                2 * np.pi * frequency * remainder(model.jerk, slot / 2) + model.fading * slot / 2
+                2 * np.pi * frequency * remainder(model.jerk, half) + model.fading * half
             )
             left_out = "jerk, turning and obliquity within pieces of the frame"
             row = self._row(parts, model.speed, most, left_out, max(PHASE_ERROR, error))

@@ -149,9 +149,8 @@ class Plates(Blades):
         out = f"{r.number} rotors, {blades} flat blades as {self.radius.size} points"
         if not towards:
             return out
-        wires = r.model_copy(update={"chord_m": None, "blade_dbsm": None})
         lobes = self.wave_number * r.blade_length_m / np.pi
-        edges = blades * blade_section(wires) / (2 * lobes)  # mean of a sinc squared over a turn
+        edges = blades * blade_section(as_wires(r)) / (2 * lobes)  # mean of a sinc squared over a turn
         ratio = self.mean_section(*towards) / edges
         return f"{out}, {10 * np.log10(max(ratio, DARK)):+.0f} dB against their edges as wires"
 
@@ -223,6 +222,19 @@ def blades_of(rotors: Rotors, waveform: Waveform, seed: int, name: str) -> Blade
         return Blades(*numbers)
     of_blades = (np.broadcast_to(v[:, None], start.shape).ravel() for v in (spin, lead))
     return Plates(*numbers, r, middle, nodes, start.ravel(), *of_blades)
+
+
+def as_wires(rotors: Rotors) -> Rotors:
+    """Return rotors with the edges of their blades alone. A stated level of a plate is that along
+    its normal, and none of its edges."""
+    if rotors.chord_m is None:
+        return rotors
+    return rotors.model_copy(update={"chord_m": None, "blade_dbsm": None})
+
+
+def points_of(rotors: Rotors, waveform: Waveform) -> int:
+    """Return the number of points of a UAV's blades, of which a path has one copy in each slot."""
+    return blades_of(rotors, waveform, 0, "").radius.size
 
 
 def chord_nodes(rotors: Rotors, waveform: Waveform) -> np.ndarray:
