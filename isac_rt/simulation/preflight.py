@@ -335,8 +335,9 @@ def warn_of_other_chirps(waveforms: Mapping[str, Waveform]) -> None:
     ]
     if pairs:
         _warn(
-            f"{', '.join(pairs)} sweep over the same frequencies with different chirps or clocks; the "
-            "run leaves out that they interfere, for noise.model snr knows no power; take link_budget"
+            f"{', '.join(pairs)} sweep over the same frequencies with different chirps or clocks; "
+            "the run leaves out that they interfere, for noise.model snr knows no power; take "
+            "link_budget"
         )
 
 

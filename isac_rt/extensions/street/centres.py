@@ -212,9 +212,7 @@ class MovingCentres:
                         half = (slot + beyond) / 2
             if not most and Link(name, name) in found and name in self.own:
                 continue
-            error = (
-                2 * np.pi * frequency * remainder(model.jerk, half) + model.fading * half
-            )
+            error = 2 * np.pi * frequency * remainder(model.jerk, half) + model.fading * half
             left_out = "jerk, turning and obliquity within pieces of the frame"
             row = self._row(parts, model.speed, most, left_out, max(PHASE_ERROR, error))
             out.append({"what": f"moving parts of {name}", **row})

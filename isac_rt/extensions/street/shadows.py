@@ -1,16 +1,19 @@
 r"""Shadows of boxes that move, constant over pieces of a frame.
 
 The part of a box that lies between the ends of a straight part of a path is a screen across it, in
-the middle of that part: the smallest rectangle about its silhouette whose one side is level. By
-Babinet's principle its factor is, with `knife_edge` F of the edges at the heights u and v in
-Fresnel units,
+the middle of that part: the smallest rectangle about its silhouette, along the path, whose one side
+is level. By Babinet's principle its factor is, with `knife_edge` F of the edges at the heights u
+and v in Fresnel units,
 
 .. math:: 1 - \big(F(u_1) - F(u_2)\big)\big(F(v_1) - F(v_2)\big)
 
 exact in the Fresnel approximation for a rectangle (M. Born and E. Wolf, *Principles of Optics*,
-section 8.7). Within a frame ends, UAVs and points of reflection move on straight lines. Since
-:math:`|F'| = 1/\sqrt2` and :math:`|F(v_1) - F(v_2)| \le 1.4`, an edge that moves by one Fresnel
-unit changes the factor by one at most. Pieces of whole slots are as short as `STEP` asks.
+section 8.7). A Fresnel unit is that of the distances along the path to the terminals or scatterers
+before and after the screen: waves go on over faces that reflect, and begin anew where a UAV or
+another scatterer sends them. Within a frame ends, UAVs and points of reflection move on straight
+lines. Since :math:`|F'| = 1/\sqrt2` and :math:`|F(v_1) - F(v_2)| \le 1.4`, an edge that moves by
+one Fresnel unit changes the factor by one at most. Pieces, all of one length, are as short as
+`STEP` asks.
 """
 
 from __future__ import annotations
@@ -49,7 +52,8 @@ class Part(NamedTuple):
     ----------
     rows : (K,) of the paths
     starts, ends : (K, 3) [m]
-    before, total : (K,) length of the path before the part, and of all of it [m]
+    before, total : (K,) length of the path from the last terminal or scatterer to the part, and
+        from there to the next [m]
     """
 
     rows: np.ndarray
@@ -93,18 +97,20 @@ class Shadows:
         """Return into how many pieces (K,) the frame is to be cut for each path."""
         chain, velocity = self.stops(paths)
         moved = np.zeros(len(paths))
+        times = (-self.half_frame, 0.0, self.half_frame)
         fastest = np.linalg.norm(velocity, axis=2).max(initial=0.0)
         for box in self.boxes:
             reach = (fastest + float(np.linalg.norm(box.pose.velocity))) * self.half_frame
             heights = np.full((3, chain.shape[1] - 1, len(paths), 4), np.nan)
-            for i, time in enumerate((-self.half_frame, 0.0, self.half_frame)):
+            for i, time in enumerate(times):
                 parts = self._parts(paths, chain + velocity * time, box)
                 for k, part in enumerate(parts):
                     rows, first, last = screen(box.at(time), part, self.wavelength, reach)
-                    matters = np.maximum(first, -last).max(axis=1) < LIT_REACH
-                    edges = np.concatenate([first, last], axis=1)[matters]
-                    heights[i, k, rows[matters]] = np.clip(edges, -RIPPLE_REACH, RIPPLE_REACH)
-            moved += np.nansum(np.abs(np.diff(heights, axis=0)), axis=(0, 1, 3))
+                    heights[i, k, rows] = np.concatenate([first, last], axis=1)
+            least, most = (pick(heights[:-1], heights[1:]) for pick in (np.minimum, np.maximum))
+            lit = ((least[..., :2] > LIT_REACH) | (most[..., 2:] < -LIT_REACH)).any(axis=-1)
+            ripples = (least < RIPPLE_REACH) & (most > -RIPPLE_REACH) & ~lit[..., None]
+            moved += np.where(ripples, most - least, 0.0).sum(axis=(0, 1, 3))
         return np.maximum(np.ceil(moved / (2 * STEP)), 1).astype(int)
 
     def _parts(self, paths: PathSet, chain: np.ndarray, box: Box) -> Iterator[Part]:
@@ -112,10 +118,17 @@ class Shadows:
         placed = placed_paths(paths)
         own = (paths.target == box.number) | (paths.faces == FIRST_BOX - box.number).any(axis=1)
         lengths = np.linalg.norm(np.diff(chain, axis=1), axis=2)
-        before, total = np.cumsum(lengths, axis=1) - lengths, lengths.sum(axis=1)
+        passes = _mirrors(paths) | np.pad(
+            ~np.isfinite(paths.points).all(axis=2), ((0, 0), (1, 1)), constant_values=False
+        )
+        before, after = np.zeros_like(lengths), np.zeros_like(lengths)
+        for k in range(1, lengths.shape[1]):
+            before[:, k] = np.where(passes[:, k], before[:, k - 1] + lengths[:, k - 1], 0.0)
+            after[:, -k - 1] = np.where(passes[:, -k - 1], after[:, -k] + lengths[:, -k], 0.0)
+        total = before + lengths + after
         for k in range(lengths.shape[1]):
             rows = np.flatnonzero(placed & ~own & (lengths[:, k] > 0))
-            yield Part(rows, chain[rows, k], chain[rows, k + 1], before[rows, k], total[rows])
+            yield Part(rows, chain[rows, k], chain[rows, k + 1], before[rows, k], total[rows, k])
 
     def stops(self, paths: PathSet) -> tuple[np.ndarray, np.ndarray]:
         """Return the ends of each path's straight parts (K, B + 2, 3), some of which have no
@@ -125,7 +138,6 @@ class Shadows:
         chain = np.concatenate([ends[0][0], paths.points, ends[1][0]], axis=1)
         velocity = np.concatenate([ends[0][1], np.zeros(paths.points.shape), ends[1][1]], axis=1)
         faces = np.pad(paths.faces, ((0, 0), (1, 1)), constant_values=-1)
-        mirror = (faces != -1) & (paths.kind != PathKind.DIFFUSE)[:, None]
         for box in self.boxes:
             velocity[faces == FIRST_BOX - box.number] = box.pose.velocity
         for index in np.unique(paths.target[paths.target >= 0]):
@@ -137,7 +149,7 @@ class Shadows:
             missing = ~np.isfinite(chain[:, k])
             velocity[:, k] = np.where(missing, velocity[:, k + 1], velocity[:, k])
             chain[:, k] = np.where(missing, chain[:, k + 1], chain[:, k])
-        return chain, _with_reflections(chain, velocity, mirror)
+        return chain, _with_reflections(chain, velocity, _mirrors(paths))
 
     def over_frame(self, paths: PathSet) -> OverFrame:
         """Return the factors of paths over those at the epoch, in the frame."""
@@ -151,9 +163,10 @@ class Shadows:
     def in_pieces(
         self, paths: PathSet, waveform: Waveform, later: float, least_power: float
     ) -> PathSet:
-        """Return paths over `least_power` cut where their shadows change, in a frame whose middle
-        is `later` than the epoch [s]."""
-        placed = placed_paths(paths) & (paths.power > least_power)
+        """Return paths cut where their shadows change, in a frame whose middle is `later` than the
+        epoch [s]: those over `least_power`, or in a shadow at the epoch by less than 1/`STEP` of
+        their amplitude."""
+        placed = placed_paths(paths) & (paths.power > least_power * STEP**2)
         some, rest = paths.select(placed), paths.select(~placed)
         changing = self.over_frame(some)
         parts = [rest, some.select(changing.counts == 1)]
@@ -195,6 +208,12 @@ def placed_paths(paths: PathSet) -> np.ndarray:
     """Mark the paths (K,) whose way is known: not statistical clutter, leakage or moving parts."""
     known = np.isfinite(paths.points).any(axis=(1, 2))
     return np.asarray(known | (paths.kind == PathKind.LINE_OF_SIGHT))
+
+
+def _mirrors(paths: PathSet) -> np.ndarray:
+    """Mark the stops (K, B + 2) of paths at which a face reflects them."""
+    mirror = (paths.faces != -1) & (paths.kind != PathKind.DIFFUSE)[:, None]
+    return np.pad(mirror, ((0, 0), (1, 1)), constant_values=False)
 
 
 def _with_reflections(chain: np.ndarray, velocity: np.ndarray, mirror: np.ndarray) -> np.ndarray:
