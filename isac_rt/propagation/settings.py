@@ -11,6 +11,10 @@ from pydantic import Field
 from isac_rt.registry import PROPAGATION_MODELS
 from isac_rt.settings import Decibels, Loss, Node, Positive, Problem, Vector
 
+LEAST_RAIN = 0.01
+"""Rain rate [mm/h] below which there are too few drops for a distribution of their sizes."""
+MOST_WIND_MPS = 100.0
+
 
 class Leakage(Node):
     """Coupling of a terminal's transmitter into its own receiver."""
@@ -74,6 +78,12 @@ class Weather(Node):
         return name not in ("wind_mps", "turbulence_mps") or self.rain_mm_per_h > 0
 
     def problems(self) -> Iterator[Problem]:
+        if 0 < self.rain_mm_per_h < LEAST_RAIN:
+            text = f"is no rain yet; take 0, or at least {LEAST_RAIN:g} mm/h"
+            yield Problem((("rain_mm_per_h",),), text)
+        if (wind := math.hypot(*self.wind_mps)) > MOST_WIND_MPS:
+            text = f"blows at {wind:.4g} m/s, at most {MOST_WIND_MPS:g} m/s are taken; lower it"
+            yield Problem((("wind_mps",),), text)
         celsius = self.temperature_c
         # Magnus' formula for the pressure [hPa] of saturated vapour, and its density
         saturated = 6.112 * math.exp(17.62 * celsius / (243.12 + celsius))

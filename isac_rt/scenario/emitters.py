@@ -9,7 +9,7 @@ from pydantic import Field
 
 from isac_rt.frame.settings import Array
 from isac_rt.scenario.swarm import Uav
-from isac_rt.settings import Decibels, Finite, Node, Positive, Problem, Vector
+from isac_rt.settings import Decibels, Node, Positive, Problem, Vector
 from isac_rt.world.settings import Rcs, Waypoint
 
 FLIGHT = ("position_m", "velocity_mps", "waypoints", "boresight", "mount_deg")
@@ -45,9 +45,9 @@ class Emitter(Node):
     """Slope of its chirps [MHz/us], negative for falling ones."""
     ramp_us: Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
     """Duration of the ramp of a chirp [us]."""
-    idle_us: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    idle_us: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
     """Pause between a ramp's end and the next one's start [us]."""
-    offset_us: Finite | None = None
+    offset_us: Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)] | None = None
     """Start of its first chirp, or of the first of each burst, after time 0 [us]. null, the
     default: drawn within one repetition by `seed` and name."""
     clock_drift_ppm: Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)] = 0.0
@@ -71,8 +71,10 @@ class Emitter(Node):
         yield from Uav.model_construct(role="active", **self._flight).problems()
         if not any(self.boresight):
             yield Problem((("boresight",),), "points nowhere; give a direction such as [0, 1, 0]")
-        if self.slope_mhz_per_us * self.ramp_us * 1e6 + self.start_hz <= 0:
-            message = "ends below 0 Hz; shorten the ramp, or give start_hz in hertz"
+        end = self.slope_mhz_per_us * self.ramp_us * 1e6 + self.start_hz
+        if not 0 < end <= 1e12:
+            over = "above 1e12 Hz" if end > 0 else "below 0 Hz"
+            message = f"ends {over}; shorten the ramp, or give start_hz in hertz"
             yield Problem((("ramp_us",), ("start_hz",)), message)
         if (self.burst_chirps is None) != (self.burst_interval_s is None):
             message = "goes with burst_interval_s, and this with it; state both or none"

@@ -118,13 +118,32 @@ def check_flights(swarm: Swarm, timetable: Timetable) -> None:
             )
     for (a, first), (b, second) in itertools.combinations(polylines.items(), 2):
         distance = np.linalg.norm(first - second, axis=1)
-        nearest, boxes = int(np.argmin(distance)), (swarm.uavs[a].box, swarm.uavs[b].box)
-        least = max([NEAREST_M, *(min(box.size_m) / 2 for box in boxes if box is not None)])
-        if distance[nearest] < least:
+        nearest = int(np.argmin(distance))
+        if distance[nearest] < NEAREST_M:
             raise ScenarioError(
                 f"swarm.{b}: is {distance[nearest]:.2g} m from {a} at {epochs[nearest]:.4g} s "
                 f"(frame {nearest * step}), at least "
-                f"{least:g} m are needed; change one of their flights"
+                f"{NEAREST_M:g} m are needed; change one of their flights"
+            )
+        _check_box(swarm, epochs, (a, b), second - first)
+        _check_box(swarm, epochs, (b, a), first - second)
+
+
+def _check_box(
+    swarm: Swarm, epochs: np.ndarray, names: tuple[str, str], offset: np.ndarray
+) -> None:
+    """Refuse flights on which the second of two UAVs, `offset` (T, 3) from the first, is in its
+    box."""
+    name, inner = names
+    if (box := swarm.uavs[name].box) is None:
+        return
+    half = np.array(box.size_m) / 2
+    for i in np.flatnonzero(np.linalg.norm(offset, axis=1) < np.linalg.norm(half)):
+        pose = swarm.trajectories[name].pose(epochs[i])
+        if (np.abs(pose.to_body(offset[i])) <= half).all():
+            raise ScenarioError(
+                f"swarm.{inner}: is inside the box of {name} at {epochs[i]:.4g} s; change one of "
+                "their flights, or the box's size_m"
             )
 
 

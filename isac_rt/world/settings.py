@@ -271,7 +271,7 @@ class Rotors(Node):
     quadcopter of 1 kg."""
     blades: Annotated[int, Field(ge=1, le=8)] = 2
     """Number of blades of each rotor; by default two."""
-    blade_length_m: Annotated[float, Field(gt=0, le=1)] = 0.12
+    blade_length_m: Annotated[float, Field(ge=0.005, le=1)] = 0.12
     """Length of a blade from the hub to its tip [m]. The default is that of a quadcopter of
     1 kg."""
     rev_per_min: Annotated[float, Field(ge=0, le=100_000)] = 6000.0
@@ -323,6 +323,11 @@ class Rotors(Node):
             )
 
 
+MOST_SIZE_M = 100.0
+Side = Annotated[float, Field(gt=0, le=MOST_SIZE_M)]
+"""Of a moving body [m]."""
+
+
 class Centre(Node):
     """One scattering centre of a target with extent."""
 
@@ -338,6 +343,9 @@ class Centre(Node):
     def problems(self) -> Iterator[Problem]:
         if (self.value_dbsm is None) == (self.table is None):
             yield Problem((("value_dbsm",), ("table",)), "a centre has one of both; state one")
+        if (off := math.hypot(*self.position_m)) > MOST_SIZE_M:
+            text = f"is {off:.4g} m from the middle of the UAV, at most {MOST_SIZE_M:g} m are taken"
+            yield Problem((("position_m",),), f"{text}; it is in metres")
 
 
 class Extent(Node):
@@ -347,7 +355,7 @@ class Extent(Node):
     kind: Literal["uav", "vehicle", "agv", "pedestrian", "centres"]
     """Kind of target: `uav`, `vehicle` and `agv` are 3GPP TR 38.901's with a centre on each face,
     `pedestrian` has limbs that swing, `centres` are stated."""
-    size_m: Annotated[tuple[Positive, Positive, Positive], Field()] | None = None
+    size_m: tuple[Side, Side, Side] | None = None
     """Width, length and height [m]; of a pedestrian the height counts. null, the default: 3GPP's,
     1.5 x 1.6 x 0.7 (uav), 2 x 5 x 1.6 (vehicle), 1 x 0.5 x 0.5 (agv), 0.5 x 0.5 x 1.75."""
     centres: tuple[Centre, ...] = ()
@@ -375,7 +383,7 @@ class Extent(Node):
 class Box(Node):
     """Closed box about a UAV's position that shadows and mirrors, such as a car or a tram."""
 
-    size_m: tuple[Positive, Positive, Positive]
+    size_m: tuple[Side, Side, Side]
     """Width, length and height [m], along right, ahead and up of the UAV's body."""
     material: str = "metal"
     """Material of all faces, by its name in the table of materials or in `city.materials`. By

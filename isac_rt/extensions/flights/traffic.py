@@ -54,6 +54,8 @@ def traffic(
         cars = floating_cars(file, "*")
     except OSError as problem:
         raise ValueError(f"cannot be read: {problem.strerror}") from None
+    if start and start[0] != "@":
+        raise ValueError(f"#*{start} is not #*@START, START the time in the file [s]")
     begin = number(start[1:], 1, "START") if start else 0.0
     reach = STEPS_BESIDE * cars.step
     out: dict[str, dict[str, Any]] = {}
@@ -62,7 +64,8 @@ def traffic(
         held = (times >= -reach) & (times <= duration + reach)
         if (held & (times >= 0) & (times <= duration)).any() and held.sum() >= 2:
             key = re.sub("[^A-Za-z0-9_-]", "_", name)
-            key += "_" * (key in out)
+            while key in out:
+                key += "_"
             row = np.column_stack([times, rows[:, 1:]])[held]
             out[key] = _vehicle(stated, cars, name, row, from_degrees)
     if not 0 < len(out) <= MOST_VEHICLES:
@@ -87,7 +90,9 @@ def _vehicle(
     if cars.on_earth:
         places = from_degrees(places[:, [1, 0, 2]])
         places[np.isnan(rows[:, 3]), 2] = 0.0
-    course, slope = np.nan_to_num(rows[:, 4:].T)
+    if np.isnan(rows[:, 4]).any():
+        raise ValueError(f"{name} has no angle, which says where it heads; have SUMO write it")
+    course, slope = rows[:, 4], np.nan_to_num(rows[:, 5])
     if name in cars.persons:
         out |= PERSON
         places[:, 2] += HIPS_M

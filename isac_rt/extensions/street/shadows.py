@@ -108,8 +108,12 @@ class Shadows:
                     rows, first, last = screen(box.at(time), part, self.wavelength, reach)
                     heights[i, k, rows] = np.concatenate([first, last], axis=1)
             least, most = (pick(heights[:-1], heights[1:]) for pick in (np.minimum, np.maximum))
-            lit = ((least[..., :2] > LIT_REACH) | (most[..., 2:] < -LIT_REACH)).any(axis=-1)
-            ripples = (least < RIPPLE_REACH) & (most > -RIPPLE_REACH) & ~lit[..., None]
+            beyond = (least[..., :2] > LIT_REACH) | (most[..., 2:] < -LIT_REACH)
+            ripples = (
+                (least < RIPPLE_REACH)
+                & (most > -RIPPLE_REACH)
+                & ~beyond.any(axis=-1, keepdims=True)
+            )
             moved += np.where(ripples, most - least, 0.0).sum(axis=(0, 1, 3))
         return np.maximum(np.ceil(moved / (2 * STEP)), 1).astype(int)
 

@@ -87,10 +87,14 @@ def test_every_vehicle_is_a_box_behind_its_bumper(tmp_path, caplog):
         (("frame_interval_s: 0.2", ""), "need frame_interval_s"),
         (("@2", "@9"), "0 of 5 vehicles and persons move in the 2 s from START"),
         (("fcd.xml#*", "none.xml#*"), "cannot be read: No such file"),
+        (("#*@2", "#*~2@2"), "is not #.@START"),
+        (("#*@2", "#*@0"), "truck has no angle"),
     ],
 )
 def test_traffic_that_cannot_be_is_one_message(tmp_path, change, said):
     scene = fcd(tmp_path)
+    about = (tmp_path / "fcd.xml").read_text()
+    (tmp_path / "fcd.xml").write_text(about.replace('y="0" angle="0"', 'y="0"'))
     scene.write_text(SCENE.replace(*change))
     with pytest.raises(ScenarioError, match=said) as refused:
         load(scene)

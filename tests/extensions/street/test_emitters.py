@@ -250,6 +250,8 @@ def test_radars_of_chirps_shorter_than_any_that_is_stated_disturb_each_other():
         (["emitters.car.boresight=[0,0,0]"], "points nowhere"),
         (["emitters.gate.start_hz=77"], "emitters.gate.start_hz"),
         (["emitters.gate.slope_mhz_per_us=-9000"], "ends below 0 Hz"),
+        (["emitters.gate.slope_mhz_per_us=1e4", "emitters.gate.ramp_us=1e6"], "ends above 1e12 Hz"),
+        (["emitters.gate.offset_us=1e300"], "emitters.gate.offset_us"),
         (["emitters.car.velocity_mps=[0,20000,0]"], "faster than"),
         (["emitters.car.position_m=[15,0,5]", *OPEN], "emitters.car: starts inside a building"),
         (["emitters.car.position_m=[3,20,-1]", *OPEN], "emitters.car: .*under its ground"),

@@ -538,7 +538,7 @@ def test_traced_paths_are_kept_whatever_the_rotors():
     [
         ({"rotors": {"rev_per_min": 50_000}}, "faster than sound"),
         ({"rotors": {}, "rcs": {"model": "relative"}}, "another rcs.model"),
-        ({"rotors": {"blade_length_m": 0}}, "greater than 0"),
+        ({"rotors": {"blade_length_m": 0}}, "greater than or equal to 0.005"),
         ({"rotors": {"number": 1}, "role": "passive"}, "0 m from the arrays"),
     ],
 )

@@ -3,14 +3,20 @@ integrals."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.special import fresnel
 from truths.cars import CHIRPS, OWN, SQUARE_METRE, WAVEFORM, WAVELENGTH, box_of, paths_at, stage
 
+import isac_rt as irt
+from isac_rt.document import ScenarioError
 from isac_rt.extensions.street.shadows import STEP
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.world.settings import Uav
+
+SCENES = Path(__file__).parents[3] / "scenes"
 
 
 def edge(height, before, after):
@@ -40,6 +46,21 @@ def test_an_echo_fades_by_the_distances_to_its_uav(place):
 
     ratio = echo(place) / echo(-1000.0)
     assert ratio == pytest.approx(screen(place - 40, place, 10, 20) ** 2, abs=3e-3)
+
+
+def test_a_uav_in_a_box_is_refused():
+    """A quarter of the way along a wall, and beyond its end. Planted bug: its smallest half side
+    as the distance kept."""
+    scene, wall = SCENES / "quadcopter.yaml", "role: object, position_m: [500, 0, 50]"
+    wall += ", boresight: [0, 1, 0], box: {size_m: [1, 80, 1]}"
+    for north in (20, 41):
+        uav = f"{{role: target, position_m: [500.4, {north}, 50.4]}}"
+        said = [f"swarm.wall={{{wall}}}", f"swarm.inner={uav}"]
+        if north < 40:
+            with pytest.raises(ScenarioError, match=r"swarm.inner: is inside the box of wall"):
+                irt.prepare(irt.load(scene, said))
+        else:
+            irt.prepare(irt.load(scene, said))
 
 
 @pytest.mark.parametrize(("width", "speed", "distance"), [(60.0, 200.0, 1.0), (0.1, 200.0, 1.0)])

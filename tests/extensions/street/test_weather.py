@@ -255,6 +255,8 @@ def test_the_plan_says_what_weather_costs(monkeypatch):
             r"weather.vapour_g_per_m3=20: .*holds 10.6 g/m\^3 at most",
         ),
         (["weather.rain_mm_per_h=-1"], "weather.rain_mm_per_h"),
+        (["weather.rain_mm_per_h=1e-30"], "is no rain yet"),
+        (["weather={rain_mm_per_h: 5, wind_mps: [1e9, 0, 0]}"], "blows at 1e"),
         (["weather.snow=1"], "weather.snow"),
         (["radio.carrier_hz=0.9e9"], "weather: .*1 to 1000 GHz"),
     ],
