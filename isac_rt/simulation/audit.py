@@ -133,7 +133,8 @@ def _items(setup: Setup, frames: Sequence[int]) -> list[Item]:
     for frame in frames:
         _LOG.info("tracing frame %d, one of %d", frame, len(frames))
         poses, traced = setup.find(frame)
-        seen.append((poses, traced))
+        if setup.boxes is not None:
+            seen.append((poses, traced))
         fastest = max(float(np.linalg.norm(pose.velocity)) for pose in poses.values())
         last = setup.frame_of(frame, poses, traced)
         for link, use in last.uses.items():
