@@ -133,7 +133,7 @@ def _name(ax: Axes, points: np.ndarray, names: Mapping[int, str]) -> None:
         ax.annotate(
             name,
             point,
-            xytext=(placed[u].p0 - here) * 72 / figure.dpi,
+            xytext=(placed[-1].p0 - here) * 72 / figure.dpi,
             textcoords="offset points",
             fontweight="bold",
             color=colour_of(u),

@@ -272,6 +272,9 @@ def test_figures_draw_the_box_where_it_is():
     outline = scene_map(Figure().subplots(), dataset.isel(frame=slice(5))).patches[0].get_xy()
     near = np.linalg.norm(outline[:, None] - np.array(corners)[:, :2], axis=2).min(axis=1)
     assert near.max() < 1e-6 and len(outline) >= 5
+    objects = dataset.assign(role=("uav", ["object", *dataset.role.values[1:]]))
+    named = {text.get_text() for text in scene_map(Figure().subplots(), objects).texts}
+    assert named - {""} == set(dataset.uav.values[1:])
 
 
 def test_the_plan_counts_what_boxes_do(traffic):
