@@ -120,7 +120,8 @@ def test_terminals_believe_materials(tmp_path):
 def test_a_terminal_does_not_believe_its_mesh_against_the_samples(monkeypatch):
     """A street whose houses on one side the terminals' mesh lacks: their walls are found in every
     frame. 1.6 false tracks a frame were measured (0.25 to 2.2 with seeds 1 to 4), over ten with
-    the memory of still echoes switched off. Bug: two hits confirm a track beside any number of spots, 10.8 a frame."""
+    the memory of still echoes switched off. Bug: two hits confirm a track beside any number of
+    spots, 10.8 a frame."""
     said = [
         "clutter={model: field}",
         "modulation={acquisition_frames: 1, pilot_every_frames: null}",
