@@ -29,6 +29,8 @@ PLACES = {
     "florence_square": ["clutter={model: field}"],
 }
 """Scenes with what is changed in them."""
+TOLD = {"florence_square": ["cooperation=tracks"]}
+"""Where a passive terminal is told, too, where its transmitter is."""
 FALSE = {"florence_square": 8}
 """False tracks in 16 frames; none elsewhere. There the track of the transmitter is 1 m/s off across
 the line of sight, and echoes of walls are taken for a UAV's (6 measured)."""
@@ -115,9 +117,12 @@ def no_more_than(count: int, cells: int, rate: float) -> bool:
 @pytest.mark.sionna
 @pytest.mark.parametrize("scene", PLACES)
 def test_a_passive_terminal_alarms_no_more_often_than_designed(scene, monkeypatch):
-    """Alarms at 1e-4 a cell and starts at 1e-6. Planted bug: no whitening."""
+    """Alarms at 1e-4 a cell and starts at 1e-6. In Florence the transmitter's track is 1 m/s off
+    across the line of sight for more than a dozen frames, so that its word must count: without, 28
+    alarms and 17 starts in 9,485 cells of clutter. Planted bugs: no whitening; the word not used.
+    """
     counter = Counter(monkeypatch)
-    rates = counted(counter, scene, Link("AT", "PT1"), PLACES[scene])
+    rates = counted(counter, scene, Link("AT", "PT1"), [*PLACES[scene], *TOLD.get(scene, [])])
     for cells, *found in counter.counts:
         for count, rate in zip(found, rates, strict=True):
             assert no_more_than(count, cells, rate)
