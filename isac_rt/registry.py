@@ -93,7 +93,7 @@ DETECTORS = Registry(
     "detectors",
     {
         "cfar": "isac_rt.receive.chain:cfar_with",
-        "comb_cfar": "isac_rt.extensions.street.comb:comb_cfar",
+        "comb_cfar": "isac_rt.extensions.street.comb:CombCfar",
         "angle_doppler": "isac_rt.extensions.city_receivers.angle_doppler:AngleDoppler",
     },
 )

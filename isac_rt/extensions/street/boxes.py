@@ -94,7 +94,6 @@ class Boxes:
         swarm, names = self._swarm, list(self._swarm.uavs)
         return [
             Box(
-                name,
                 names.index(name),
                 *shape,
                 poses[name],

@@ -301,11 +301,14 @@ class Attitude(NamedTuple):
     rate: np.ndarray
     accel: np.ndarray
 
+    def axes_at(self, time: np.ndarray) -> np.ndarray:
+        """Return the axes (T, 3, 3) at times (T,) [s since the epoch]."""
+        t = time[:, None]
+        return Rotation.from_rotvec((self.rate + self.accel * t / 2) * t).as_matrix() @ self.axes
+
     def turned(self, own: Motion, time: np.ndarray) -> Motion:
         """Return a motion in the body's axes in world axes, at times (T,) [s since the epoch]."""
-        t = time[:, None]
-        turn = Rotation.from_rotvec((self.rate + self.accel * t / 2) * t)
-        axes = turn.as_matrix() @ self.axes
+        t, axes = time[:, None], self.axes_at(time)
         spin = (self.rate + self.accel * t)[:, None] @ axes  # in body axes
         turning = np.cross(spin, own.place)
         velocity = own.velocity + turning

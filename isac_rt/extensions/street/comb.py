@@ -16,10 +16,8 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from isac_rt.receive.cfar import CfarRule
-from isac_rt.receive.estimate import Estimator
 from isac_rt.receive.known import Known
 from isac_rt.receive.sense import Cfar
-from isac_rt.receive.settings import Receivers
 
 
 @dataclass(frozen=True)
@@ -39,10 +37,4 @@ class CombCfar(Cfar):
 
     def rule(self, known: Known) -> CfarRule:
         """Return the rule of a frame."""
-        rule = super().rule(known)
-        return CombRule(rule.rate, rule.guard, rule.training, rule.looks)
-
-
-def comb_cfar(settings: Receivers, estimator: Estimator) -> Cfar:
-    """Return the detector, with the Doppler processing of the schedule."""
-    return CombCfar(settings, estimator)
+        return CombRule(**vars(super().rule(known)))

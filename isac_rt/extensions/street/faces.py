@@ -18,7 +18,6 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from isac_rt.extensions.street.centres import Attitude
 from isac_rt.extensions.street.occlusion import Occlusion
@@ -43,14 +42,13 @@ class Box(NamedTuple):
 
     Attributes
     ----------
-    name, number : of the UAV, and its place among all
+    number : place of the UAV among all
     half : (3,) half its width, length and height [m]
     material : of its faces
     pose : of its middle
     attitude : of its axes
     """
 
-    name: str
     number: int
     half: np.ndarray
     material: Material
@@ -61,15 +59,8 @@ class Box(NamedTuple):
         """Return the box at a time [s since the epoch], as far as it shadows."""
         place, velocity, acceleration = self.pose.motion()
         moved = replace(self.pose, position=place + (velocity + acceleration * time / 2) * time)
-        return self._replace(
-            pose=moved, attitude=self.attitude._replace(axes=self.axes_at([time])[0])
-        )
-
-    def axes_at(self, time: Sequence[float] | np.ndarray) -> np.ndarray:
-        """Return the axes (T, 3, 3) at times (T,) [s since the epoch]."""
-        t = np.asarray(time)[:, None]
-        turn = Rotation.from_rotvec((self.attitude.rate + self.attitude.accel * t / 2) * t)
-        return turn.as_matrix() @ self.attitude.axes
+        axes = self.attitude.axes_at(np.array([time]))[0]
+        return self._replace(pose=moved, attitude=self.attitude._replace(axes=axes))
 
 
 class Stretch(NamedTuple):
@@ -115,7 +106,7 @@ class Mirrors:
     @cached_property
     def _axes(self) -> list[np.ndarray]:
         """Axes (T, 3, 3) of each box at all instants."""
-        return [box.axes_at(self._time) for box in self.boxes]
+        return [box.attitude.axes_at(self._time) for box in self.boxes]
 
     def between_terminals(self, state: LinkState) -> Iterator[PathSet]:
         """Yield the paths from end to end over one face each."""
