@@ -9,7 +9,7 @@
 # %% [markdown]
 # # Micro-Doppler
 # Blades and limbs move against the body that carries them, and spread its echo in Doppler. A
-# spectrogram over slow time shows how: a quadcopter first, then a pedestrian.
+# spectrogram over slow time shows how; a car, rain and a foreign radar follow.
 
 # %%
 import matplotlib.pyplot as plt
@@ -102,3 +102,65 @@ power = sum(10 ** (spectrogram(profiles[:, c], 96, 12) / 10) for c in cells)
 fig, ax = plt.subplots(figsize=(8, 4))
 slot = setup.waveform.slot_duration
 show(ax, 10 * np.log10(power), slot, 12, "a pedestrian who comes nearer at 1.3 m/s")
+
+# %% [markdown]
+# ## Flat blades
+# Seen from nearly below, wires turn across the view: nothing comes nearer, and their echo is at the
+# body's Doppler. With a chord a blade is a plate, and flashes when its tilted normal passes the
+# radar, once a turn for each of two blades.
+
+# %%
+hover = "{role: target, position_m: [0.3, 0.5, 6], rotors: {number: 1, rev_per_min: 1500"
+fig, axes = plt.subplots(1, 2, figsize=(11, 4), sharey=True)
+for ax, chord in zip(axes, ("null", 0.015), strict=True):
+    above = [f"swarm.Q={hover}, chord_m: {chord}}}}}", "swarm.radar.boresight=[0,0.1,1]"]
+    longer = "radio.chirps_per_frame=1200"
+    setup = irt.prepare(irt.load(scene, [*one_transmitter, *above, longer]))
+    signal, slot = slow_time(setup), setup.waveform.slot_duration
+    show(ax, spectrogram(signal, 32, 4), slot, 4, "wires" if chord == "null" else "plates")
+fig.tight_layout()
+
+# %% [markdown]
+# ## A car in the street
+# Power by range in 20 frames: the car goes by at 5.5 m, its side a flash when the radar is across
+# from it, and hides the pedestrian at 13 m behind it for as long.
+
+# %%
+setup = irt.prepare(irt.load("../scenes/street_traffic.yaml"))
+cubes = [setup.frame(f).samples(("radar", "radar")).samples[0] for f in range(20)]
+moving = [cube - cube.mean(axis=1, keepdims=True) for cube in cubes]  # what stands still is out
+window = np.hanning(cubes[0].shape[-1])
+profiles = [(np.abs(np.fft.fft(cube * window)) ** 2).mean(axis=(0, 1)) for cube in moving]
+w = setup.waveform
+shown = 10 * np.log10(np.transpose(profiles))[: int(20 / w.range_cell(2))]
+fig, ax = plt.subplots(figsize=(8, 4))
+ax.imshow(shown, aspect="auto", origin="lower", extent=(0, 20, 0, 20), vmin=np.median(shown))
+_ = ax.set(xlabel="frame", ylabel="range [m]", title="a car before a pedestrian")
+
+# %% [markdown]
+# ## Rain, and a foreign radar
+# Rain is an echo at all ranges, with the Doppler of falling drops and of the wind. A foreign radar
+# with a repetition of 50 us crosses our band in every fifth chirp of 40 us, here as it begins.
+
+# %%
+weather = ["weather.rain_mm_per_h=50", "weather.wind_mps=[0, -3, 0]", "swarm.Q.rotors=null"]
+car = "position_m: [3, 20, 1], boresight: [0, -1, 0], start_hz: 76.9e9, slope_mhz_per_us: 17"
+foreign = [f"emitters.car={{{car}, ramp_us: 40, idle_us: 10}}", "swarm.Q.rotors=null"]
+fig, axes = plt.subplots(1, 2, figsize=(11, 4))
+rain, crossed = (
+    irt.prepare(irt.load(scene, [*one_transmitter, *more])) for more in (weather, foreign)
+)
+cube = rain.frame(0).samples(("radar", "radar")).samples[0]
+window = np.outer(np.hanning(cube.shape[1]), np.hanning(cube.shape[2]))
+map_ = (np.abs(np.fft.fftshift(np.fft.fft2(cube * window), axes=1)) ** 2).mean(axis=0)
+edge = rain.waveform.wavelength / (4 * rain.waveform.slot_duration)
+cells = int(30 / rain.waveform.range_cell(2))
+power = 10 * np.log10(map_[::-1, :cells].T)  # the IF has -f_D: closing is positive
+extent = (-edge, edge, 0, 30)
+axes[0].imshow(power, aspect="auto", origin="lower", extent=extent, vmin=np.median(power))
+axes[0].set(xlabel="closing velocity [m/s]", ylabel="range [m]", title="rain of 50 mm/h")
+cube = crossed.frame(0).samples(("radar", "radar")).samples[0, 0]
+level = 20 * np.log10(np.abs(cube))
+axes[1].imshow(level, aspect="auto", origin="lower", vmin=np.median(level))
+axes[1].set(xlabel="sample", ylabel="chirp", title="a foreign radar")
+fig.tight_layout()
