@@ -549,8 +549,8 @@ OF_CASES = {
     ),
     "sliding shadows": Bug(
         "extensions/street/shadows.py",
-        "for part in self._parts(paths, chain + velocity * time, box)",
-        "for part in self._parts(paths, chain, box)",
+        "places = stops.places + stops.velocities * time",
+        "places = stops.places",
     ),
 }
 """For each case of `isac-rt validate` one bug with which it fails (``--planted``)."""

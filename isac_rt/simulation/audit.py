@@ -42,7 +42,7 @@ from isac_rt.simulation.plan import (
     frame_reach,
     next_slot_delay,
 )
-from isac_rt.simulation.setup import Frame, Setup, link_budgets
+from isac_rt.simulation.setup import Frame, Setup, link_budgets, part_of
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 
@@ -93,10 +93,8 @@ def tracer_of(setup: Setup) -> RayTracer | None:
         return None
     from isac_rt.propagation.raytrace import RayTracer
 
-    model: Any = setup.propagation
-    while not isinstance(model, RayTracer):
-        model = model.model
-    return model
+    tracer: RayTracer = part_of(setup.propagation, RayTracer)
+    return tracer
 
 
 def _spread(values: Sequence[int], count: int) -> list[int]:

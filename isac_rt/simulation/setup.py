@@ -338,10 +338,7 @@ class Setup:
         """Boxes of UAVs (`isac_rt.extensions.street.boxes.Boxes`); None without."""
         if not any(uav.box for uav in self.swarm.uavs.values()):
             return None
-        model: Any = self.propagation
-        while not isinstance(model, extension("boxes")):
-            model = model.model
-        return model
+        return part_of(self.propagation, extension("boxes"))
 
     @cached_property
     def emitters(self) -> Any:
@@ -678,6 +675,11 @@ def _maker(
     settings = scenario.propagation, scenario.clutter
     ground = Ground(*settings, plan.swarm, city, plan.waveform, free, plan.max_untraced, floor)
     return partial(make_propagation, ground)
+
+
+def part_of(model: Any, kind: type) -> Any:
+    """Return the part of a propagation model that is of a type; each has the next as `model`."""
+    return model if isinstance(model, kind) else part_of(model.model, kind)
 
 
 def _extended(

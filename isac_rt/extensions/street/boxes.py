@@ -52,7 +52,8 @@ class Boxes:
         waveform: Waveform,
         city: Any,
     ) -> None:
-        self.model, self._swarm, self._free, self._waveform = model, swarm, free, waveform
+        self.model, self._swarm, self._free = model, swarm, free
+        self._half_frame = waveform.frame_duration / 2
         self._occlusion = Occlusion(city, waveform.carrier_frequency)
         self._shapes: dict[str, tuple[np.ndarray, Material]] = {}
         for name, uav in swarm.uavs.items():
@@ -72,22 +73,22 @@ class Boxes:
         """Return the model's paths and those over faces, shadowed."""
         found, dropped = self.model.trace(poses, epoch, links)
         out = {}
-        half_frame = self._waveform.frame_duration / 2
-        mirrors = Mirrors(self._boxes(poses, epoch), self._free, self._occlusion, half_frame)
+        boxes = self._boxes(poses, epoch)
+        mirrors = Mirrors(boxes, self._free, self._occlusion, self._half_frame)
         for link, paths in found.items():
             state = LinkState(link, epoch, poses[link.tx], poses[link.rx], paths.target_names)
             over = mirrors.between_terminals(state), mirrors.echoes(state, poses)
             every = merge([paths, *itertools.chain(*over)])
-            about = mirrors.boxes, state, poses, self._free.wavelength, half_frame
-            out[link] = replace(every, gain=every.gain * Shadows(*about).factor(every))
+            shadows = Shadows(boxes, state, poses, self._free.wavelength, self._half_frame)
+            out[link] = replace(every, gain=every.gain * shadows.factor(every))
         return Traced(out, dropped)
 
     def shadows(self, paths: PathSet, poses: dict[str, Pose]) -> Shadows:
         """Return the shadows on a link's paths at their epoch."""
         (tx, rx), epoch = paths.link, paths.epoch
         state = LinkState(paths.link, epoch, poses[tx], poses[rx], paths.target_names)
-        about = self._boxes(poses, epoch), state, poses, self._free.wavelength
-        return Shadows(*about, self._waveform.frame_duration / 2)
+        boxes = self._boxes(poses, epoch)
+        return Shadows(boxes, state, poses, self._free.wavelength, self._half_frame)
 
     def _boxes(self, poses: dict[str, Pose], epoch: float) -> list[Box]:
         """Return the boxes at an instant."""

@@ -110,7 +110,8 @@ class MovingCentres:
             least = 0.0 if model.replaces_echo else least_power
             bases = [b for b in self._bases(paths, target == name, poses, of) if b.power > least]
             if bases:
-                begin, time = self.pieces(self._slots_of_piece(paths, poses, of), later)
+                slots = self._slots_of_piece(paths, poses, of)
+                begin, time = pieces(self.waveform, slots, later)
                 offset = of[2].turned(model.motion(paths.epoch + time), time)
                 for base in bases:
                     amplitudes = model.amplitudes(*base.towards, paths.epoch + time)
@@ -153,7 +154,7 @@ class MovingCentres:
         if not paths.link.own or paths.tx not in self.own:
             return None
         name, model = paths.tx, self.own[paths.tx]
-        begin, time = self.pieces(1, later)
+        begin, time = pieces(self.waveform, 1, later)
         axes = body_axes(self.swarm, name, paths.epoch)
         motion = Motion(*(m @ axes.T for m in model.motion(paths.epoch + time)))
         distance, rate, accel = _distance(motion)
@@ -251,11 +252,6 @@ class MovingCentres:
             "estimate": error,
             "unit": "rad",
         }
-
-    def pieces(self, slots: int, later: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return when pieces of so many slots begin and the last ends (T + 1,), and their middles
-        (T,) [s since the epoch], the middle of the frame `later` than the epoch."""
-        return pieces(self.waveform, slots, later)
 
     def _slots_of_piece(
         self,

@@ -63,6 +63,20 @@ class Part(NamedTuple):
     total: np.ndarray
 
 
+class Stops(NamedTuple):
+    """Ends of the straight parts of K paths at the epoch, some of which have no length.
+
+    Attributes
+    ----------
+    places, velocities : (K, B + 2, 3) [m, m/s]
+    passed : (K, B + 2) whether a wave goes on there and does not begin anew
+    """
+
+    places: np.ndarray
+    velocities: np.ndarray
+    passed: np.ndarray
+
+
 @dataclass(frozen=True)
 class Shadows:
     """Shadows of the boxes of a frame on the paths of one link.
@@ -84,27 +98,28 @@ class Shadows:
 
     def factor(self, paths: PathSet, time: float = 0.0) -> np.ndarray:
         """Return the factor (K,) of all boxes at a time [s since the epoch]."""
-        chain, velocity = self.stops(paths)
-        out = np.ones(len(paths), complex)
-        for box in self.boxes:
-            for part in self._parts(paths, chain + velocity * time, box):
+        return self._factors(paths, [time])[0]
+
+    def _factors(self, paths: PathSet, times: Sequence[float]) -> np.ndarray:
+        """Return the factors (T, K) of all boxes at times (T,) [s since the epoch]."""
+        stops, out = self.stops(paths), np.ones((len(times), len(paths)), complex)
+        for (i, time), box in itertools.product(enumerate(times), self.boxes):
+            for part in self._parts(paths, stops, time, box):
                 rows, first, last = screen(box.at(time), part, self.wavelength)
                 screened = (knife_edge(first) - knife_edge(last)).prod(axis=1)
-                out[rows] *= tapered(1 - screened, np.maximum(first, -last).max(axis=1))
+                out[i, rows] *= tapered(1 - screened, np.maximum(first, -last).max(axis=1))
         return out
 
     def counts(self, paths: PathSet) -> np.ndarray:
         """Return into how many pieces (K,) the frame is to be cut for each path."""
-        chain, velocity = self.stops(paths)
-        moved = np.zeros(len(paths))
+        stops, moved = self.stops(paths), np.zeros(len(paths))
         times = (-self.half_frame, 0.0, self.half_frame)
-        fastest = np.linalg.norm(velocity, axis=2).max(initial=0.0)
+        fastest = np.linalg.norm(stops.velocities, axis=2).max(initial=0.0)
         for box in self.boxes:
             reach = (fastest + float(np.linalg.norm(box.pose.velocity))) * self.half_frame
-            heights = np.full((3, chain.shape[1] - 1, len(paths), 4), np.nan)
+            heights = np.full((3, stops.places.shape[1] - 1, len(paths), 4), np.nan)
             for i, time in enumerate(times):
-                parts = self._parts(paths, chain + velocity * time, box)
-                for k, part in enumerate(parts):
+                for k, part in enumerate(self._parts(paths, stops, time, box)):
                     rows, first, last = screen(box.at(time), part, self.wavelength, reach)
                     heights[i, k, rows] = np.concatenate([first, last], axis=1)
             least, most = (pick(heights[:-1], heights[1:]) for pick in (np.minimum, np.maximum))
@@ -117,26 +132,25 @@ class Shadows:
             moved += np.where(ripples, most - least, 0.0).sum(axis=(0, 1, 3))
         return np.maximum(np.ceil(moved / (2 * STEP)), 1).astype(int)
 
-    def _parts(self, paths: PathSet, chain: np.ndarray, box: Box) -> Iterator[Part]:
-        """Yield the straight parts that a box may shadow, the first of all paths first."""
-        placed = placed_paths(paths)
+    def _parts(self, paths: PathSet, stops: Stops, time: float, box: Box) -> Iterator[Part]:
+        """Yield the straight parts that a box may shadow at a time [s since the epoch], the first
+        of all paths first."""
+        placed, passed = placed_paths(paths), stops.passed
         own = (paths.target == box.number) | (paths.faces == FIRST_BOX - box.number).any(axis=1)
-        lengths = np.linalg.norm(np.diff(chain, axis=1), axis=2)
-        passes = _mirrors(paths) | np.pad(
-            ~np.isfinite(paths.points).all(axis=2), ((0, 0), (1, 1)), constant_values=False
-        )
+        places = stops.places + stops.velocities * time
+        lengths = np.linalg.norm(np.diff(places, axis=1), axis=2)
         before, after = np.zeros_like(lengths), np.zeros_like(lengths)
         for k in range(1, lengths.shape[1]):
-            before[:, k] = np.where(passes[:, k], before[:, k - 1] + lengths[:, k - 1], 0.0)
-            after[:, -k - 1] = np.where(passes[:, -k - 1], after[:, -k] + lengths[:, -k], 0.0)
+            before[:, k] = np.where(passed[:, k], before[:, k - 1] + lengths[:, k - 1], 0.0)
+            after[:, -k - 1] = np.where(passed[:, -k - 1], after[:, -k] + lengths[:, -k], 0.0)
         total = before + lengths + after
         for k in range(lengths.shape[1]):
             rows = np.flatnonzero(placed & ~own & (lengths[:, k] > 0))
-            yield Part(rows, chain[rows, k], chain[rows, k + 1], before[rows, k], total[rows, k])
+            yield Part(rows, places[rows, k], places[rows, k + 1], before[rows, k], total[rows, k])
 
-    def stops(self, paths: PathSet) -> tuple[np.ndarray, np.ndarray]:
-        """Return the ends of each path's straight parts (K, B + 2, 3), some of which have no
-        length, and their velocities."""
+    def stops(self, paths: PathSet) -> Stops:
+        """Return the ends of the paths' straight parts; a point that is missing has none, at the
+        stop after it."""
         count, (start, end) = len(paths), (self.state.start, self.state.end)
         ends = [np.broadcast_to(e.motion()[:2, None, None], (2, count, 1, 3)) for e in (start, end)]
         chain = np.concatenate([ends[0][0], paths.points, ends[1][0]], axis=1)
@@ -153,16 +167,16 @@ class Shadows:
             missing = ~np.isfinite(chain[:, k])
             velocity[:, k] = np.where(missing, velocity[:, k + 1], velocity[:, k])
             chain[:, k] = np.where(missing, chain[:, k + 1], chain[:, k])
-        return chain, _with_reflections(chain, velocity, _mirrors(paths))
+        mirrors, missing = _mirrors(paths), ~np.isfinite(paths.points).all(axis=2)
+        return Stops(chain, _with_reflections(chain, velocity, mirrors), mirrors | _inner(missing))
 
     def over_frame(self, paths: PathSet) -> OverFrame:
         """Return the factors of paths over those at the epoch, in the frame."""
         counts = self.counts(paths)
         some = paths.select(counts > 1)
-        now = self.factor(some)
         time = np.linspace(-self.half_frame, self.half_frame, counts.max(initial=1) + 1)
-        values = [self.factor(some, t) / np.where(now == 0, 1, now) for t in time.tolist()]
-        return OverFrame(counts, time, np.array(values))
+        now, *values = self._factors(some, [0.0, *time.tolist()])
+        return OverFrame(counts, time, np.array(values) / np.where(now == 0, 1, now))
 
     def in_pieces(
         self, paths: PathSet, waveform: Waveform, later: float, least_power: float
@@ -216,8 +230,12 @@ def placed_paths(paths: PathSet) -> np.ndarray:
 
 def _mirrors(paths: PathSet) -> np.ndarray:
     """Mark the stops (K, B + 2) of paths at which a face reflects them."""
-    mirror = (paths.faces != -1) & (paths.kind != PathKind.DIFFUSE)[:, None]
-    return np.pad(mirror, ((0, 0), (1, 1)), constant_values=False)
+    return _inner((paths.faces != -1) & (paths.kind != PathKind.DIFFUSE)[:, None])
+
+
+def _inner(points: np.ndarray) -> np.ndarray:
+    """Return a mask of points (K, B) as one of stops (K, B + 2), without the ends."""
+    return np.pad(points, ((0, 0), (1, 1)), constant_values=False)
 
 
 def _with_reflections(chain: np.ndarray, velocity: np.ndarray, mirror: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from truths.moving import echo_over
 
 import isac_rt as irt
 from isac_rt.document import ScenarioError
-from isac_rt.extensions.street import centres
+from isac_rt.extensions.street import centres, motion
 from isac_rt.extensions.street.centres import MovingCentres, remainder
 from isac_rt.extensions.street.rotors import (
     PLASTIC,
@@ -69,7 +69,7 @@ def slow_time(body, distance, w, receiver=None):
     moving = MovingCentres(swarm, {"U": Isotropic()}, w, POINT, [("U", body)])
     poses = ends | swarm.poses(0.0)
     paths = moving.with_centres(echo, poses, 0.0)
-    t = moving.pieces(1, 0.0)[1]
+    t = motion.pieces(w, 1, 0.0)[1]
     alive = at_times(paths.select(np.arange(1, len(paths))), t)
     beyond = (alive["delay"] - echo.delay) * w.carrier_frequency
     return (alive["gain"] * np.exp(2j * np.pi * beyond)).sum(axis=1), t, alive
@@ -380,7 +380,7 @@ def test_ghosts_follow_the_centre_over_the_mirror():
 
     moving = MovingCentres(swarm, {"U": Isotropic()}, w, POINT, [("U", body)])
     paths = moving.with_centres(ghost, {"A": radar} | swarm.poses(0.0), 0.0)
-    pieces, time = paths.select(np.arange(1, len(paths))), moving.pieces(1, 0.0)[1]
+    pieces, time = paths.select(np.arange(1, len(paths))), motion.pieces(w, 1, 0.0)[1]
     for t, delay in zip(time, at_times(pieces, time)["delay"], strict=True):
         mirrored, point, at = scene_at(t)
         way = np.linalg.norm(point - mirrored) + np.linalg.norm(point - at)
