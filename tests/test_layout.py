@@ -243,7 +243,7 @@ MAX_LINES = {
     "signal": 837,
     "receive": 6083,
     "track": 1949,
-    "scenario": 2207,
+    "scenario": 2213,
     "results": 3745,
     "simulation": 3779,
     "sweep": 2785,

@@ -420,7 +420,13 @@ def _with_traffic(
             degrees = partial(_from_degrees, geo=_georeference(tree.get("city"), folder))
             about = folder / head, start, frames * interval, degrees
             found = extension("traffic")(uav, *about)
-            out.update({f"{name}_{key}": vehicle for key, vehicle in found.items()})
+            vehicles = {f"{name}_{key}": vehicle for key, vehicle in found.items()}
+            if twice := sorted(vehicles.keys() & {*swarm, *out}):
+                raise ValueError(
+                    f"{head} has a vehicle or person that is named swarm.{twice[0]}, which is "
+                    f"stated too; rename one of swarm.{name} and swarm.{twice[0]}"
+                )
+            out.update(vehicles)
         except ValueError as problem:
             if faults is None:
                 raise TableError(("swarm", name, "flight"), str(problem)) from None

@@ -89,9 +89,11 @@ def test_every_vehicle_is_a_box_behind_its_bumper(tmp_path, caplog):
         (("fcd.xml#*", "none.xml#*"), "cannot be read: No such file"),
         (("#*@2", "#*~2@2"), "is not #.@START"),
         (("#*@2", "#*@0"), "truck has no angle"),
+        (("  street:", "  street_bus: {role: target}\n  street:"), "named swarm.street_bus, which"),
     ],
 )
 def test_traffic_that_cannot_be_is_one_message(tmp_path, change, said):
+    """Planted bug: a vehicle of a stated UAV's name takes its place."""
     scene = fcd(tmp_path)
     about = (tmp_path / "fcd.xml").read_text()
     (tmp_path / "fcd.xml").write_text(about.replace('y="0" angle="0"', 'y="0"'))
