@@ -274,9 +274,12 @@ class Rotors(Node):
     blade_length_m: Annotated[float, Field(ge=0.005, le=1)] = 0.12
     """Length of a blade from the hub to its tip [m]. The default is that of a quadcopter of
     1 kg."""
-    rev_per_min: Annotated[float, Field(ge=0, le=100_000)] = 6000.0
-    """Revolutions per minute. The default is that of a quadcopter of 1 kg that hovers; 0: blades
-    stand still."""
+    rev_per_min: Annotated[float, Field(ge=0)] | tuple[float, ...] = 6000.0
+    """Revolutions per minute, or those of each rotor, positive clockwise seen from above. The
+    default is that of a quadcopter of 1 kg that hovers; 0: blades stand still."""
+    phase_deg: tuple[Finite, ...] | None = None
+    """Angle of each rotor's first blade at time 0, clockwise from ahead seen from above [degrees].
+    null, the default: drawn by `seed` and the UAV's name."""
     blade_dbsm: Decibels | None = None
     """Cross-section of a blade at its flash, seen across its length [dBsm]. null, the default: that
     of a plastic edge, or along the normal of a plastic plate (docs/moving.md)."""
@@ -288,6 +291,14 @@ class Rotors(Node):
     is that of a propeller with a pitch of 4 inches at three quarters of 12 cm."""
     height_m: Annotated[float, Field(ge=-2, le=2)] = 0.0
     """Height of the rotors over the UAV's position, where its arrays are [m]. The default is 0."""
+
+    @field_validator("rev_per_min", mode="before")
+    @classmethod
+    def _one_speed_or_one_for_each(cls, value: Any) -> Any:
+        least, numbers = (-math.inf, value) if isinstance(value, list | tuple) else (0, [value])
+        if not all(isinstance(n, int | float) and math.isfinite(n) and n >= least for n in numbers):
+            raise ValueError("must be a number from 0 on, or a list with one for each rotor")
+        return value
 
     def applies(self, name: str) -> bool:
         return name != "incidence_deg" or self.chord_m is not None
@@ -304,11 +315,24 @@ class Rotors(Node):
         return self.number * self.blades * self.blade_length_m
 
     @property
+    def speeds(self) -> tuple[float, ...]:
+        """Revolutions per minute of each rotor, positive clockwise seen from above."""
+        if isinstance(self.rev_per_min, tuple):
+            return self.rev_per_min
+        return tuple((-1) ** i * self.rev_per_min for i in range(self.number))
+
+    @property
     def tip_speed(self) -> float:
-        """Speed of a blade's tip [m/s]."""
-        return 2 * math.pi * self.rev_per_min / 60 * self.blade_length_m
+        """Speed of the fastest blade's tip [m/s]."""
+        fastest = max(map(abs, self.speeds), default=0.0)
+        return 2 * math.pi * fastest / 60 * self.blade_length_m
 
     def problems(self) -> Iterator[Problem]:
+        for key in ("rev_per_min", "phase_deg"):
+            values = getattr(self, key)
+            if isinstance(values, tuple) and len(values) != self.number:
+                text = f"{len(values)} values for {self.number} rotors; state one for each"
+                yield Problem(((key,), ("number",)), text)
         if (total := self.total_length) > MOST_BLADES_M:
             yield Problem(
                 (("number",), ("blades",), ("blade_length_m",)),

@@ -193,20 +193,21 @@ class Plates(Blades):
 
 
 def blades_of(rotors: Rotors, waveform: Waveform, seed: int, name: str) -> Blades:
-    """Return the points of a UAV's rotors, with phases at time 0 drawn by the UAV's name."""
+    """Return the points of a UAV's rotors, their phases at time 0 stated or drawn by its name."""
     r, w = rotors, waveform
     highest = 2 * np.pi * (w.carrier_frequency + w.bandwidth) / SPEED_OF_LIGHT
     middle = 2 * np.pi * (w.carrier_frequency + w.bandwidth / 2) / SPEED_OF_LIGHT
     length, weight = blade_points(r.blade_length_m, highest)
     nodes, tilt = chord_nodes(r, w), np.radians(r.incidence_deg)
-    rotor = np.arange(r.number)
-    where = (rotor + 0.5) * 2 * np.pi / r.number
+    where = (np.arange(r.number) + 0.5) * 2 * np.pi / r.number
     arm = r.arm_m if r.number > 1 else 0.0
     hub = arm * np.stack([np.sin(where), np.cos(where), np.zeros(r.number)], axis=1)
     begin = generator(seed, "rotors", name).uniform(0, 2 * np.pi, r.number)
+    if r.phase_deg is not None:
+        begin = np.radians(r.phase_deg)
     start = begin[:, None] + np.arange(r.blades) * 2 * np.pi / r.blades
-    lead = (-1.0) ** rotor
-    spin = lead * 2 * np.pi * r.rev_per_min / 60
+    spin = 2 * np.pi * np.array(r.speeds) / 60
+    lead = np.copysign(1.0, spin)
     shape = (r.number, r.blades, nodes.size, length.size)
     off = (r.chord_m or 0.0) / 2 * nodes[:, None]
     side = lead[:, None, None, None] * np.cos(tilt) * off  # ahead of the blade's axis
@@ -250,7 +251,7 @@ def chord_nodes(rotors: Rotors, waveform: Waveform) -> np.ndarray:
         return np.zeros(1)
     k = 2 * np.pi * (w.carrier_frequency + w.bandwidth) / SPEED_OF_LIGHT
     turn = max(
-        np.pi * r.rev_per_min / 60 * w.slot_duration,
+        r.tip_speed / r.blade_length_m / 2 * w.slot_duration,
         (3 * PHASE_ERROR / (k * r.blade_length_m)) ** (1 / 3),
     )
     beyond = k * r.chord_m * (turn + w.bandwidth / (2 * w.carrier_frequency))

@@ -220,7 +220,13 @@ def blades_and_hubs(rotors, body, time):
     for b in range(rotors.number * rotors.blades):
         where = (b // rotors.blades + 0.5) * 2 * np.pi / rotors.number
         hub = rotors.arm_m * np.array([np.sin(where), np.cos(where), 0]) * (rotors.number > 1)
-        yield body.start[b] + body.spin[b] * time, (-1) ** (b // rotors.blades), hub
+        start, rotor = body.start[b], b // rotors.blades
+        speed = (-1) ** rotor * np.array(rotors.rev_per_min)
+        if rotors.phase_deg is not None:
+            start = np.radians(rotors.phase_deg[rotor]) + b % rotors.blades * np.pi
+            speed = rotors.rev_per_min[rotor]
+        spin, lead = np.pi * speed / 30, np.copysign(1, speed)
+        yield start + spin * time, lead, hub
 
 
 def physical_optics(rotors, body, time, u1, u2):
@@ -234,21 +240,49 @@ def physical_optics(rotors, body, time, u1, u2):
     return total * area * k / np.sqrt(np.pi) * np.sqrt(PLASTIC)
 
 
-@pytest.mark.parametrize("bistatic", [False, True])
-def test_a_flat_blade_equals_its_integral_of_physical_optics(bistatic):
-    """At generic directions to 1e-4 of the flash, and on the normal to 4 pi A^2/lambda^2. Planted
-    bugs: `chord @ incident` for `chord @ both`; the phase of `nodes` with the other sign; `lead`
-    left out of `side`; `np.sin(tilt)` of the places without."""
+def test_rotors_flash_by_their_own_phase_and_speed():
+    """Only where phase and 6 rev/min t are 90 degrees or -90 do blades lie across the view. Planted
+    bugs: the first phase for all; the first speed for all; a negative speed taken as positive."""
+    w = irt.Waveform(num_chirps=450, num_groups=1)
+    speeds, phases = (2000.0, 2700.0, -3300.0), (35.0, -20.0, 170.0)
+    rotors = Rotors(number=3, arm_m=0, blades=1, rev_per_min=speeds, phase_deg=phases)
+    rotors = rotors.model_copy(update={"blade_length_m": 0.03, "blade_dbsm": 0.0})
+    signal, t, _ = slow_time(blades_of(rotors, w, 1, "U"), 1e5, w)
+    half_turns = [(p + 6 * s * t - 90) / 180 for p, s in zip(phases, speeds, strict=True)]
+    flashes = [k for turn in half_turns for k in np.flatnonzero(np.diff(np.floor(turn)))]
+    assert len(flashes) >= 7
+    assert min(np.abs(signal[k : k + 2]).max() for k in flashes) > 0.8
+    beside = np.abs(half_turns - np.rint(half_turns)).min(axis=0) > 0.1
+    assert np.abs(signal[beside]).max() < 0.4
+
+
+OTHER_WAYS = PLATES.model_copy(update={"rev_per_min": (-4e3, -6e3), "phase_deg": (20.0, 130.0)})
+
+
+@pytest.mark.parametrize(
+    ("rotors", "bistatic"), [(PLATES, False), (PLATES, True), (OTHER_WAYS, True)]
+)
+def test_a_flat_blade_equals_its_integral_of_physical_optics(rotors, bistatic):
+    """At generic directions to 1e-4 of the flash. Planted bugs: `chord @ incident` for `chord @
+    both`; the phase of `nodes` with the other sign; `lead` left out of `side`, or that of every
+    second rotor turned whatever its speed; `np.sin(tilt)` of the places without."""
     w, rng = irt.Waveform(num_chirps=6), np.random.default_rng(3)
-    body = blades_of(PLATES, w, 1, "U")
-    k, flash = body.wave_number, np.sqrt(blade_section(PLATES, body.wave_number))
+    body = blades_of(rotors, w, 1, "U")
+    k, flash = body.wave_number, np.sqrt(blade_section(rotors, body.wave_number))
     for _ in range(10):
         u1, u2 = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
         u2, t = u2 if bistatic else u1, np.array([rng.uniform(0, 1)])
         gain = body.amplitudes(u1, u2, t)[0]
         found = gain.conj() @ np.exp(-1j * k * body.motion(t).place[0] @ (u1 + u2))
-        truth = physical_optics(PLATES, body, t[0], u1, u2)
+        truth = physical_optics(rotors, body, t[0], u1, u2)
         assert abs(found - truth) < 1e-4 * flash
+
+
+def test_a_flat_blade_flashes_along_its_normal():
+    """4 pi A^2/lambda^2. Planted bug: `obliquity` without its half."""
+    w = irt.Waveform(num_chirps=6)
+    body = blades_of(PLATES, w, 1, "U")
+    k, flash = body.wave_number, np.sqrt(blade_section(PLATES, body.wave_number))
     tilt = np.radians(PLATES.incidence_deg)
     angle = body.start[0]  # at time 0, seen along the normal of the first rotor's first blade
     back = -np.array([np.cos(angle), -np.sin(angle), 0])
@@ -537,6 +571,10 @@ def test_traced_paths_are_kept_whatever_the_rotors():
     ("uav", "message"),
     [
         ({"rotors": {"rev_per_min": 50_000}}, "faster than sound"),
+        ({"rotors": {"number": 2, "rev_per_min": [1, -50_000]}}, "faster than sound"),
+        ({"rotors": {"rev_per_min": [6000, 5000]}}, "2 values for 4 rotors; state one"),
+        ({"rotors": {"rev_per_min": -1}}, "from 0 on, or a list with one for each"),
+        ({"rotors": {"phase_deg": []}}, "0 values for 4 rotors"),
         ({"rotors": {}, "rcs": {"model": "relative"}}, "another rcs.model"),
         ({"rotors": {"blade_length_m": 0}}, "greater than or equal to 0.005"),
         ({"rotors": {"number": 1}, "role": "passive"}, "0 m from the arrays"),
