@@ -203,7 +203,7 @@ class Frame:
         least /= s.plan.cell_noise_gain(paths.tx) / s.waveform.num_chirps  # of one chirp
         shadows = None if s.boxes is None else s.boxes.shadows(paths, self.poses)
         if s.moving_centres is not None:
-            shadow = None if shadows is None else shadows.over_frame(paths)
+            shadow = None if shadows is None else shadows.change
             paths = s.moving_centres.with_centres(paths, self.poses, when, least, shadow)
         if shadows is not None:
             paths = shadows.in_pieces(paths, s.waveform, when - paths.epoch, least)

@@ -90,7 +90,7 @@ class MovingCentres:
         poses: Mapping[str, Pose],
         middle: float,
         least_power: float = 0.0,
-        shadow: Callable[[int, np.ndarray], np.ndarray] | None = None,
+        shadow: Callable[[PathSet, np.ndarray], np.ndarray] | None = None,
     ) -> PathSet:
         """Return a link's paths with those over centres, piece by piece of the frame.
 
@@ -99,7 +99,7 @@ class MovingCentres:
         poses : at the paths' epoch
         middle : of the receiver's frame [s]
         least_power : |gain|^2 of all centres together that a path over them must exceed
-        shadow : factor of the amplitude of a path, by its row, at times [s since the epoch]
+        shadow : factor of the amplitude of paths (K,), each at its time (K,) [s since the epoch]
         """
         target = _echoing(paths)
         gives_way = [name for name, model in self.models if model.replaces_echo]
@@ -113,10 +113,15 @@ class MovingCentres:
                 slots = self._slots_of_piece(paths, poses, of)
                 begin, time = pieces(self.waveform, slots, later)
                 offset = of[2].turned(model.motion(paths.epoch + time), time)
-                for base in bases:
+                faded = np.ones((len(bases), time.size))
+                if shadow is not None:
+                    row = np.repeat([base.row for base in bases], time.size)
+                    faded = shadow(paths.select(row), np.tile(time, len(bases)))
+                    faded = faded.reshape(len(bases), -1)
+                for base, fade in zip(bases, faded, strict=True):
                     amplitudes = model.amplitudes(*base.towards, paths.epoch + time)
                     if shadow is not None:
-                        amplitudes = amplitudes * shadow(base.row, time)[:, None]
+                        amplitudes = amplitudes * fade[:, None]
                     parts.append(_copies(base, amplitudes, offset, begin, time))
         own = self.own_echoes(paths, poses, later)
         if own is not None and (own.power.sum() > least_power * self.waveform.num_chirps):

@@ -96,31 +96,35 @@ class Shadows:
     wavelength: float
     half_frame: float
 
-    def factor(self, paths: PathSet, time: float = 0.0) -> np.ndarray:
-        """Return the factor (K,) of all boxes at a time [s since the epoch]."""
-        return self._factors(paths, [time])[0]
-
-    def _factors(self, paths: PathSet, times: Sequence[float]) -> np.ndarray:
-        """Return the factors (T, K) of all boxes at times (T,) [s since the epoch]."""
-        stops, out = self.stops(paths), np.ones((len(times), len(paths)), complex)
-        for (i, time), box in itertools.product(enumerate(times), self.boxes):
+    def factor(self, paths: PathSet, time: float | np.ndarray = 0.0) -> np.ndarray:
+        """Return the factor (K,) of all boxes, at one time or at that of each path [s since the
+        epoch]."""
+        time, out = np.broadcast_to(time, len(paths)), np.ones(len(paths), complex)
+        stops = self.stops(paths)
+        for box in self.boxes:
             for part in self._parts(paths, stops, time, box):
-                rows, first, last = screen(box.at(time), part, self.wavelength)
+                rows, first, last = screen(box, time, part, self.wavelength)
                 screened = (knife_edge(first) - knife_edge(last)).prod(axis=1)
-                out[i, rows] *= tapered(1 - screened, np.maximum(first, -last).max(axis=1))
+                out[rows] *= tapered(1 - screened, np.maximum(first, -last).max(axis=1))
         return out
+
+    def change(self, paths: PathSet, time: np.ndarray) -> np.ndarray:
+        """Return the factor of each path (K,) at its time [s since the epoch] over that at the
+        epoch."""
+        now = self.factor(paths)
+        return self.factor(paths, time) / np.where(now == 0, 1, now)
 
     def counts(self, paths: PathSet) -> np.ndarray:
         """Return into how many pieces (K,) the frame is to be cut for each path."""
         stops, moved = self.stops(paths), np.zeros(len(paths))
-        times = (-self.half_frame, 0.0, self.half_frame)
+        times = np.multiply.outer((-self.half_frame, 0.0, self.half_frame), np.ones(len(paths)))
         fastest = np.linalg.norm(stops.velocities, axis=2).max(initial=0.0)
         for box in self.boxes:
             reach = (fastest + float(np.linalg.norm(box.pose.velocity))) * self.half_frame
             heights = np.full((3, stops.places.shape[1] - 1, len(paths), 4), np.nan)
             for i, time in enumerate(times):
                 for k, part in enumerate(self._parts(paths, stops, time, box)):
-                    rows, first, last = screen(box.at(time), part, self.wavelength, reach)
+                    rows, first, last = screen(box, time, part, self.wavelength, reach)
                     heights[i, k, rows] = np.concatenate([first, last], axis=1)
             least, most = (pick(heights[:-1], heights[1:]) for pick in (np.minimum, np.maximum))
             beyond = (least[..., :2] > LIT_REACH) | (most[..., 2:] < -LIT_REACH)
@@ -132,12 +136,12 @@ class Shadows:
             moved += np.where(ripples, most - least, 0.0).sum(axis=(0, 1, 3))
         return np.maximum(np.ceil(moved / (2 * STEP)), 1).astype(int)
 
-    def _parts(self, paths: PathSet, stops: Stops, time: float, box: Box) -> Iterator[Part]:
-        """Yield the straight parts that a box may shadow at a time [s since the epoch], the first
-        of all paths first."""
+    def _parts(self, paths: PathSet, stops: Stops, time: np.ndarray, box: Box) -> Iterator[Part]:
+        """Yield the straight parts that a box may shadow at the time (K,) of each path [s since the
+        epoch], the first of all paths first."""
         placed, passed = placed_paths(paths), stops.passed
         own = (paths.target == box.number) | (paths.faces == FIRST_BOX - box.number).any(axis=1)
-        places = stops.places + stops.velocities * time
+        places = stops.places + stops.velocities * time[:, None, None]
         lengths = np.linalg.norm(np.diff(places, axis=1), axis=2)
         before, after = np.zeros_like(lengths), np.zeros_like(lengths)
         for k in range(1, lengths.shape[1]):
@@ -170,14 +174,6 @@ class Shadows:
         mirrors, missing = _mirrors(paths), ~np.isfinite(paths.points).all(axis=2)
         return Stops(chain, _with_reflections(chain, velocity, mirrors), mirrors | _inner(missing))
 
-    def over_frame(self, paths: PathSet) -> OverFrame:
-        """Return the factors of paths over those at the epoch, in the frame."""
-        counts = self.counts(paths)
-        some = paths.select(counts > 1)
-        time = np.linspace(-self.half_frame, self.half_frame, counts.max(initial=1) + 1)
-        now, *values = self._factors(some, [0.0, *time.tolist()])
-        return OverFrame(counts, time, np.array(values) / np.where(now == 0, 1, now))
-
     def in_pieces(
         self, paths: PathSet, waveform: Waveform, later: float, least_power: float
     ) -> PathSet:
@@ -185,41 +181,18 @@ class Shadows:
         epoch [s]: those over `least_power`, or in a shadow at the epoch by less than 1/`STEP` of
         their amplitude."""
         placed = placed_paths(paths) & (paths.power > least_power * STEP**2)
-        some, rest = paths.select(placed), paths.select(~placed)
-        changing = self.over_frame(some)
-        parts = [rest, some.select(changing.counts == 1)]
-        for row in np.flatnonzero(changing.counts > 1).tolist():
-            slots = max(waveform.num_chirps // int(changing.counts[row]), 1)
-            begin, time = pieces(waveform, slots, later)
-            path = some.select(np.full(time.size, row))
-            lives = np.maximum(path.begin, begin[:-1]), np.minimum(path.end, begin[1:])
-            gain = path.gain * changing(row, time)
-            piece = replace(path, gain=gain, begin=lives[0], end=lives[1])
-            parts.append(piece.select(lives[0] < lives[1]))
-        return merge(parts)
-
-
-@dataclass(frozen=True)
-class OverFrame:
-    """Factors of paths within a frame, over those at the epoch.
-
-    Attributes
-    ----------
-    counts : (K,) pieces that each path needs
-    time : (T,) [s since the epoch]
-    values : (T, C) of the paths that need more than one, linear between times
-    """
-
-    counts: np.ndarray
-    time: np.ndarray
-    values: np.ndarray
-
-    def __call__(self, row: int, time: np.ndarray) -> np.ndarray:
-        """Return the factors of a path at times (N,)."""
-        if self.counts[row] == 1:
-            return np.ones(time.size)
-        column = int((self.counts[:row] > 1).sum())
-        return np.asarray(np.interp(time, self.time, self.values[:, column]))
+        counts = np.ones(len(paths), int)
+        counts[placed] = self.counts(paths.select(placed))
+        changing = np.flatnonzero(counts > 1)
+        cuts = [pieces(waveform, max(waveform.num_chirps // n, 1), later) for n in counts[changing]]
+        if not cuts:
+            return paths
+        row = np.repeat(changing, [time.size for _, time in cuts])
+        path, time = paths.select(row), np.concatenate([time for _, time in cuts])
+        begin = np.maximum(path.begin, np.concatenate([edges[:-1] for edges, _ in cuts]))
+        end = np.minimum(path.end, np.concatenate([edges[1:] for edges, _ in cuts]))
+        cut = replace(path, gain=path.gain * self.change(path, time), begin=begin, end=end)
+        return merge([paths.select(counts == 1), cut.select(begin < end)])
 
 
 def placed_paths(paths: PathSet) -> np.ndarray:
@@ -265,23 +238,25 @@ def _with_reflections(chain: np.ndarray, velocity: np.ndarray, mirror: np.ndarra
 
 
 def screen(
-    box: Box, part: Part, wavelength: float, reach: float = 0.0
+    box: Box, time: np.ndarray, part: Part, wavelength: float, reach: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the rows of paths whose part passes a box (N,), and the heights of its edges, the
     lower and the upper (N, 2) each in Fresnel units, level and across.
 
     Parameters
     ----------
+    time : (K,) of each path [s since the epoch]
     reach : how much farther than its shadow reaches a box counts [m]
     """
     rows, starts, ends, before, total = part
-    centre, length = box.pose.position, np.linalg.norm(ends - starts, axis=1)
+    centre, length = box.middle(time[rows]), np.linalg.norm(ends - starts, axis=1)
     along, to = (ends - starts) / length[:, None], centre - starts
     at = np.clip((to * along).sum(1), 0, length)
     off = np.linalg.norm(to - at[:, None] * along, axis=1)
     largest_unit = np.sqrt(wavelength * total / 8)
     near = np.flatnonzero(off < np.linalg.norm(box.half) + LIT_REACH * largest_unit + reach)
-    corners = centre + (CORNERS * box.half) @ box.attitude.axes.T
+    axes = box.attitude.axes_at(time[rows[near]])
+    corners = centre[near, None] + (CORNERS * box.half) @ axes.swapaxes(1, 2)
     up = vertical(along[near])
     basis = np.stack([np.cross(along[near], up), along[near], up], axis=2)  # level, along, across
     low, high = extent_between((corners - starts[near, None]) @ basis, length[near])

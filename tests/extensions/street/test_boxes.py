@@ -297,7 +297,7 @@ def test_limbs_fade_as_the_path_to_them(traffic):
     shadows = traffic.boxes.shadows(paths, frame.poses)
     plain, faded = (
         moving.with_centres(paths, frame.poses, when, 0.0, shadow)
-        for shadow in (None, shadows.over_frame(paths))
+        for shadow in (None, shadows.change)
     )
     walker = paths.target_names.index("pedestrian")
     own = np.flatnonzero((paths.target == walker) & (paths.kind == PathKind.TARGET))
