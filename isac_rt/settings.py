@@ -37,6 +37,8 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Decibels = Annotated[float, Field(ge=-400, le=400, allow_inf_nan=False)]
 Loss = Annotated[float, Field(ge=0, le=400, allow_inf_nan=False)]
 """Decibels beyond 400 are beyond any ratio of powers in nature, and overflow not far beyond."""
+ClockDrift = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
+"""Microseconds per second."""
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 """A whole number that results can keep."""
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", max_length=100)]

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from isac_rt.frame.settings import Array
 from isac_rt.scenario.swarm import Uav
-from isac_rt.settings import Decibels, Node, Positive, Problem, Vector
+from isac_rt.settings import ClockDrift, Decibels, Node, Positive, Problem, Vector
 from isac_rt.world.settings import Rcs, Waypoint
 
 FLIGHT = ("position_m", "velocity_mps", "waypoints", "boresight", "mount_deg")
@@ -50,7 +50,7 @@ class Emitter(Node):
     offset_us: Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)] | None = None
     """Start of its first chirp, or of the first of each burst, after time 0 [us]. null, the
     default: drawn within one repetition by `seed` and name."""
-    clock_drift_ppm: Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)] = 0.0
+    clock_drift_ppm: ClockDrift = 0.0
     """How much later its clock gets [microseconds per second]: its chirps slide against ours, its
     frequencies are lower by as much. Crystals: 20. By default none."""
     burst_chirps: Annotated[int, Field(ge=1, le=100_000)] | None = None

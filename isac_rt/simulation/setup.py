@@ -336,7 +336,7 @@ class Setup:
     @cached_property
     def boxes(self) -> Any:
         """Boxes of UAVs (`isac_rt.extensions.street.boxes.Boxes`); None without."""
-        if not any(uav.box for uav in self.swarm.uavs.values()):
+        if not self.swarm.has_boxes:
             return None
         return part_of(self.propagation, extension("boxes"))
 
@@ -688,9 +688,9 @@ def _extended(
     """Return a propagation model with the scenario's boxes and weather."""
     waveform = waveform_of(scenario.radio, scenario.array)
     hiding = city if scenario.propagation.model == "ray_traced" else None
-    if any(uav.box for uav in free.uavs.values()):
+    if (swarm := swarm_of(scenario)).has_boxes:
         materials = {} if scenario.city is None else scenario.city.materials
-        model = extension("boxes")(swarm_of(scenario), materials, model, free, waveform, hiding)
+        model = extension("boxes")(swarm, materials, model, free, waveform, hiding)
     if scenario.weather is not None:
         model = extension("weather")(scenario.weather, model, free, waveform, hiding)
     return model

@@ -111,7 +111,7 @@ def run(
 
 def _with_boxes(dataset: xr.Dataset, swarm: Swarm) -> xr.Dataset:
     """Return a run's dataset with the corners of the UAVs' boxes, where there are any."""
-    if not any(uav.box for uav in swarm.uavs.values()):
+    if not swarm.has_boxes:
         return dataset
     corners = extension("box_corners")(swarm, dataset.time.values)
     about = {"units": "m", "long_name": "corners of the UAV's box in world axes"}

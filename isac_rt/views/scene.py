@@ -154,7 +154,7 @@ def boxes_in(dataset: xr.Dataset) -> dict[int, np.ndarray]:
 
 def boxes_of(swarm: Swarm, time: float) -> dict[int, np.ndarray]:
     """Return the corners of a swarm's boxes (8, 3) [m] at a time [s], by the UAV's index."""
-    if not any(uav.box for uav in swarm.uavs.values()):
+    if not swarm.has_boxes:
         return {}
     names, corners = list(swarm.uavs), extension("box_corners")(swarm, [time])
     return {names.index(name): of_one[0] for name, of_one in corners.items()}

@@ -12,6 +12,7 @@ from pydantic import Field, field_validator
 from isac_rt.registry import CITY_SOURCES
 from isac_rt.settings import (
     AspectTable,
+    ClockDrift,
     Decibels,
     Finite,
     Fraction,
@@ -503,7 +504,7 @@ class Uav(Node):
     clock_offset_s: Finite = 0.0
     """How late the UAV's clock is at time 0 [s]: what it sends arrives later by this, what it
     receives seems to arrive earlier. By default all clocks agree."""
-    clock_drift_ppm: Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)] = 0.0
+    clock_drift_ppm: ClockDrift = 0.0
     """How much later the clock gets [microseconds per second]; 0.01 ppm against another clock looks
     like 3 m/s of velocity. By default none."""
     body_radius_m: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = 0.2

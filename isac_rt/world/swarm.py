@@ -206,6 +206,11 @@ class Swarm:
         return np.mean([p.position for t in times for p in self.poses(t).values()], axis=0)
 
     @property
+    def has_boxes(self) -> bool:
+        """A UAV has a box."""
+        return any(uav.box for uav in self.uavs.values())
+
+    @property
     def terminals(self) -> list[str]:
         """Names of the UAVs that send or receive."""
         return [name for name, uav in self.uavs.items() if uav.is_terminal]

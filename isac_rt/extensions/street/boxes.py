@@ -77,10 +77,10 @@ class Boxes:
         mirrors = Mirrors(boxes, self._free, self._occlusion, self._half_frame)
         for link, paths in found.items():
             state = LinkState(link, epoch, poses[link.tx], poses[link.rx], paths.target_names)
-            over = mirrors.between_terminals(state), mirrors.echoes(state, poses)
-            every = merge([paths, *itertools.chain(*over)])
+            mirrored = mirrors.between_terminals(state), mirrors.echoes(state, poses)
+            lit = merge([paths, *itertools.chain(*mirrored)])
             shadows = Shadows(boxes, state, poses, self._free.wavelength, self._half_frame)
-            out[link] = replace(every, gain=every.gain * shadows.factor(every))
+            out[link] = replace(lit, gain=lit.gain * shadows.factor(lit))
         return Traced(out, dropped)
 
     def shadows(self, paths: PathSet, poses: dict[str, Pose]) -> Shadows:
@@ -112,8 +112,8 @@ class Boxes:
             for link, paths in found.items():
                 shadows = self.shadows(paths, poses)
                 hidden = np.abs(shadows.factor(paths)) <= SHADOWED
-                every = hidden, shadows.counts(paths) > 1, (paths.faces < -1).any(axis=1)
-                counts.setdefault(link, []).append([int(mask.sum()) for mask in every])
+                masks = hidden, shadows.counts(paths) > 1, (paths.faces < -1).any(axis=1)
+                counts.setdefault(link, []).append([int(mask.sum()) for mask in masks])
         rows = []
         for link, of_link in counts.items():
             hidden, changing, over = (f"{n:.3g}" for n in np.mean(of_link, axis=0))

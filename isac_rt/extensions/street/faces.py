@@ -108,14 +108,12 @@ class Mirrors:
 
     def between_terminals(self, state: LinkState) -> Iterator[PathSet]:
         """Yield the paths from end to end over one face each."""
-        for one in self._over_faces(state):
-            ways = ScatterPaths.along(one.segments)
-            gain = one.factor * friis_amplitude(self.free.wavelength, ways.length)
+        for stretch in self._over_faces(state):
+            ways = ScatterPaths.along(stretch.segments)
+            gain = stretch.factor * friis_amplitude(self.free.wavelength, ways.length)
             gain = gain * state.elements(self.free.arrays, ways)
-            box = FIRST_BOX - int(one.faces[0])
-            yield _alive(
-                state.paths(ways, gain, PathKind.SPECULAR, target=box, **_met([one])), [one]
-            )
+            box, met = FIRST_BOX - int(stretch.faces[0]), _met([stretch])
+            yield _alive(state.paths(ways, gain, PathKind.SPECULAR, target=box, **met), [stretch])
 
     def echoes(self, state: LinkState, poses: dict[str, Pose]) -> Iterator[PathSet]:
         """Yield the echoes of UAVs over one face or two."""
@@ -124,10 +122,10 @@ class Mirrors:
                 continue
             pose = poses[name]
             seen_from = {end: replace(state, start=poses[end], end=pose) for end in state.link}
-            over = {end: list(self._over_faces(way)) for end, way in seen_from.items()}
-            if any(over.values()):
-                every = [[*self._straight(seen_from[end]), *over[end]] for end in state.link]
-                for there, back in itertools.product(*every):
+            mirrored = {end: list(self._over_faces(way)) for end, way in seen_from.items()}
+            if any(mirrored.values()):
+                ways = [[*self._straight(seen_from[end]), *mirrored[end]] for end in state.link]
+                for there, back in itertools.product(*ways):
                     if there.points.size + back.points.size:
                         yield from self._echo(state, (index, name, pose), there, back)
 
@@ -159,10 +157,10 @@ class Mirrors:
         for box, axes in zip(self.boxes, self._axes, strict=True):
             margin = margins(box, axes, (state.start, state.end), self._time)
             for axis, side in zip(*np.nonzero((margin > 0).any(axis=0)), strict=True):
-                one = self._stretch(state, box, int(axis), float(2 * side - 1))
-                if not self.occlusion.hidden(state, one.points)[0]:
+                stretch = self._stretch(state, box, int(axis), float(2 * side - 1))
+                if not self.occlusion.hidden(state, stretch.points)[0]:
                     for begin, end in lives(self._time, margin[:, axis, side]):
-                        yield one._replace(begin=begin, end=end)
+                        yield stretch._replace(begin=begin, end=end)
 
     def _stretch(self, state: LinkState, box: Box, axis: int, sign: float) -> Stretch:
         """Return the segment over a face, by Fresnel's coefficients."""
@@ -174,8 +172,8 @@ class Mirrors:
         cosine = np.abs((out * normal).sum(1))
         te, tm = slab_coefficients(box.material, cosine, self.free.wavelength)
         field = mirrored_field(vertical(along).astype(complex), along, out, normal, te, tm)
-        over = np.linalg.norm(state.start.position - image.position) / 2  # height over the face
-        point = state.start.position + along * over / np.maximum(cosine, TINY)[:, None]
+        height = np.linalg.norm(state.start.position - image.position) / 2  # over the face
+        point = state.start.position + along * height / np.maximum(cosine, TINY)[:, None]
         factor = complex((field * vertical(arrival)).sum())
         return Stretch(
             replace(segment, departure=along), factor, point, np.array([FIRST_BOX - box.number])
@@ -245,9 +243,9 @@ def margins(box: Box, axes: np.ndarray, ends: tuple[Pose, Pose], time: np.ndarra
 def lives(time: np.ndarray, margin: np.ndarray) -> list[tuple[float, float]]:
     """Return when a margin (T,) is positive, linear between times (T,); from -inf and to inf where
     it is at the ends."""
-    there = margin > 0
-    at = np.flatnonzero(there[1:] != there[:-1])
+    alive = margin > 0
+    at = np.flatnonzero(alive[1:] != alive[:-1])
     share = margin[at] / (margin[at] - margin[at + 1])
     changes = (time[at] + share * (time[at + 1] - time[at])).tolist()
-    bounds = [-np.inf] * bool(there[0]) + changes + [np.inf] * bool(there[-1])
+    bounds = [-np.inf] * bool(alive[0]) + changes + [np.inf] * bool(alive[-1])
     return list(zip(bounds[::2], bounds[1::2], strict=True))

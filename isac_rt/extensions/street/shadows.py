@@ -140,7 +140,7 @@ class Shadows:
         """Yield the straight parts that a box may shadow at the time (K,) of each path [s since the
         epoch], the first of all paths first."""
         placed, passed = placed_paths(paths), stops.passed
-        own = (paths.target == box.number) | (paths.faces == FIRST_BOX - box.number).any(axis=1)
+        of_box = (paths.target == box.number) | (paths.faces == FIRST_BOX - box.number).any(axis=1)
         places = stops.places + stops.velocities * time[:, None, None]
         lengths = np.linalg.norm(np.diff(places, axis=1), axis=2)
         before, after = np.zeros_like(lengths), np.zeros_like(lengths)
@@ -149,7 +149,7 @@ class Shadows:
             after[:, -k - 1] = np.where(passed[:, -k - 1], after[:, -k] + lengths[:, -k], 0.0)
         total = before + lengths + after
         for k in range(lengths.shape[1]):
-            rows = np.flatnonzero(placed & ~own & (lengths[:, k] > 0))
+            rows = np.flatnonzero(placed & ~of_box & (lengths[:, k] > 0))
             yield Part(rows, places[rows, k], places[rows, k + 1], before[rows, k], total[rows, k])
 
     def stops(self, paths: PathSet) -> Stops:
@@ -164,9 +164,9 @@ class Shadows:
             velocity[faces == FIRST_BOX - box.number] = box.pose.velocity
         for index in np.unique(paths.target[paths.target >= 0]):
             uav = self.poses[paths.target_names[index]]
-            there = (paths.target == index)[:, None] & (faces == -1)
-            there &= (np.abs(chain - uav.position) < 1e-6).all(axis=2)  # not a terminal
-            velocity[there] = uav.velocity
+            at_uav = (paths.target == index)[:, None] & (faces == -1)
+            at_uav &= (np.abs(chain - uav.position) < 1e-6).all(axis=2)  # not a terminal
+            velocity[at_uav] = uav.velocity
         for k in range(chain.shape[1] - 2, 0, -1):
             missing = ~np.isfinite(chain[:, k])
             velocity[:, k] = np.where(missing, velocity[:, k + 1], velocity[:, k])
@@ -197,8 +197,8 @@ class Shadows:
 
 def placed_paths(paths: PathSet) -> np.ndarray:
     """Mark the paths (K,) whose way is known: not statistical clutter, leakage or moving parts."""
-    known = np.isfinite(paths.points).any(axis=(1, 2))
-    return np.asarray(known | (paths.kind == PathKind.LINE_OF_SIGHT))
+    with_points = np.isfinite(paths.points).any(axis=(1, 2))
+    return np.asarray(with_points | (paths.kind == PathKind.LINE_OF_SIGHT))
 
 
 def _mirrors(paths: PathSet) -> np.ndarray:
@@ -260,8 +260,8 @@ def screen(
     up = vertical(along[near])
     basis = np.stack([np.cross(along[near], up), along[near], up], axis=2)  # level, along, across
     low, high = extent_between((corners - starts[near, None]) @ basis, length[near])
-    there = np.isfinite(low[:, 1])
-    near, low, high = near[there], low[there], high[there]
+    between = np.isfinite(low[:, 1])
+    near, low, high = near[between], low[between], high[between]
     middle = before[near] + (low[:, 1] + high[:, 1]) / 2
     unit = fresnel_unit(wavelength, middle, total[near] - middle)
     unit = np.maximum(unit, TINY)[:, None]
@@ -279,6 +279,6 @@ def extent_between(corners: np.ndarray, length: np.ndarray) -> tuple[np.ndarray,
     first, last = np.minimum(*shares), np.maximum(*shares)
     within = np.tile((first <= 1) & (last >= 0), (1, 2))[..., None]
     cuts = [np.clip(share, 0, 1)[..., None] for share in (first, last)]
-    found = np.concatenate([a + cut * (b - a) for cut in cuts], axis=1)
-    low, high = np.where(within, found, np.inf), np.where(within, found, -np.inf)
+    ends = np.concatenate([a + cut * (b - a) for cut in cuts], axis=1)
+    low, high = np.where(within, ends, np.inf), np.where(within, ends, -np.inf)
     return low.min(axis=1), high.max(axis=1)
