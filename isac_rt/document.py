@@ -433,6 +433,16 @@ def few_lines(lines: Sequence[str]) -> str:
     return "\n".join([*lines[:MAX_MESSAGES], *([f"... and {more} more"] if more > 0 else [])])
 
 
+def first_complaint(root: type[Node], error: ValidationError) -> str:
+    """Return the first finding of a validation of `root` in one line, with its key."""
+    found = error.errors()[0]
+    key = _key_of(found)
+    if found["type"] == "inconsistent":
+        problem = found["ctx"]["problems"][0]
+        return f"{dotted(key + problem.keys[0])}: {problem.text}"
+    return f"{dotted(key)}: {_said(root, key, found)}"
+
+
 def _key_of(error: Any) -> Key:
     """Return the key of what pydantic found."""
     return tuple(part for part in error["loc"] if not _OF_A_TYPE.match(str(part)))
@@ -452,7 +462,8 @@ def _said(root: type[Node], key: Key, found: Any) -> str:
         return f"unknown key; {guess}allowed here: {', '.join(allowed)}"
     if kind == "missing":
         few = isinstance(key[-1], int)
-        return "has too few numbers" if few else "missing, and it has no default; add it"
+        few_said = f"has too few numbers, it needs more than {key[-1]}"
+        return few_said if few else "missing, and it has no default; add it"
     if kind in ("model_type", "model_attributes_type", "dict_type"):
         allowed = _names_allowed(root, key)
         return f"must be a mapping{' with keys out of ' + ', '.join(allowed) if allowed else ''}"

@@ -265,7 +265,7 @@ class Radio(Node):
         c, sampled = self.chirp, self.samples_per_chirp / self.sampling_rate_hz
         follows = c.slope_mhz_per_us * 1e12 * self.ramp_end_s
         if not abs(self.bandwidth_hz - follows) <= STATED_SHARE * follows < math.inf:
-            text = f"but {follows:g} follows from radio.chirp; leave one of the two out"
+            text = f"but {follows:g} follows from radio.chirp; leave one out (chirp: null)"
             yield Problem((("bandwidth_hz",), ("chirp",)), text)
         last = c.adc_start_us * 1e-6 + sampled
         if last > self.ramp_end_s * (1 + 1e-9):

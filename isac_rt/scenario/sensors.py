@@ -32,12 +32,7 @@ _TI_BOARD = {
 """TI's AWR1843BOOST and IWR6843ISK: four receivers half a wavelength apart, two transmitters two
 wavelengths apart and a third between them half a wavelength higher."""
 
-_OUR_RAMP = {
-    "slope_mhz_per_us": 15.0,
-    "idle_us": 7.0,
-    "adc_start_us": 6.0,
-    "ramp_end_us": 33.0,
-}
+_OUR_RAMP = {"slope_mhz_per_us": 15.0, "idle_us": 7.0, "adc_start_us": 6.0, "ramp_end_us": 33.0}
 
 SENSORS: dict[str, dict[str, dict[str, Any]]] = {
     # 76 to 81 GHz, 3 TX, 4 RX on AWR1843BOOST; our chirp
@@ -169,4 +164,6 @@ def completed(stated: dict[str, Any], defaults: dict[str, dict[str, Any]]) -> di
         given = stated.get(key, {})
         if isinstance(given, dict):
             out[key] = {**values, **given}
+            if isinstance(chirp := given.get("chirp"), dict):
+                out[key]["chirp"] = {**values.get("chirp", {}), **chirp}
     return out

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Protocol
 import numpy as np
 from pydantic import Field, ValidationError, field_validator
 
-from isac_rt.document import Document, ScenarioError
+from isac_rt.document import Document, ScenarioError, first_complaint
 from isac_rt.randomness import seed_sequence
 from isac_rt.results.metrics import SymbolCount
 from isac_rt.results.provenance import path_content
@@ -439,13 +439,6 @@ def _try(tree: dict[str, Any], folder: Path, entry: dict[str, Any], refuse: Any)
     except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
         if not isinstance(error, ValidationError):
             raise refuse(f"({shown}): the scenario has no such key; check it") from None
-        first = error.errors()[0]
-        if first["type"] == "inconsistent":
+        if error.errors()[0]["type"] == "inconsistent":
             return
-        where = dotted(first["loc"])
-        words = (
-            "unknown key"
-            if first["type"] == "extra_forbidden"
-            else first["msg"].replace("Input should be", "must be")
-        )
-        raise refuse(f"({shown}): {where}: {words}") from None
+        raise refuse(f"({shown}): {first_complaint(Scenario, error)}") from None

@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, ValidationError
 
-from isac_rt.document import Document, ScenarioError
+from isac_rt.document import Document, ScenarioError, first_complaint
 from isac_rt.frame.schedule import decoded_schedule
 from isac_rt.frame.timetable import Timetable
 from isac_rt.frame.waveform import waveform_of
@@ -24,7 +24,7 @@ from isac_rt.randomness import generator, seed_sequence
 from isac_rt.scenario.file import folded_tree, load
 from isac_rt.scenario.swarm import unfolded
 from isac_rt.scenario.tree import Scenario
-from isac_rt.settings import Key, Name, Problem, Seed, dotted
+from isac_rt.settings import Key, Name, Problem, Seed
 from isac_rt.simulation.preflight import check_passage
 from isac_rt.simulation.setup import city_of, swarm_of, timetable_of
 from isac_rt.sweep.definition import (
@@ -275,9 +275,7 @@ class DataPlan:
 def _words(problem: Exception | None) -> str:
     """A problem in one line, with the key where a value does not fit."""
     if isinstance(problem, ValidationError):
-        first = problem.errors()[0]
-        unknown = first["type"] == "extra_forbidden"
-        return f"{dotted(first['loc'])}: {'unknown key' if unknown else first['msg']}"
+        return first_complaint(Scenario, problem)
     return str(problem).splitlines()[0]
 
 

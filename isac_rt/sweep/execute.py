@@ -23,7 +23,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import ValidationError
+
+from isac_rt.document import first_complaint
 from isac_rt.runtime import MachineProblem, available_memory, of_machine
+from isac_rt.scenario.tree import Scenario
 from isac_rt.sweep.definition import Plan, Point, Points, ground_of
 from isac_rt.sweep.outcomes import Outcomes, pending
 from isac_rt.sweep.workers import (
@@ -170,6 +174,8 @@ def _outcome(job: Job) -> dict[str, Any]:
 
 
 def _words(problem: BaseException) -> str:
+    if isinstance(problem, ValidationError):
+        return first_complaint(Scenario, problem)
     return f"{type(problem).__name__}: {problem}" if str(problem) else type(problem).__name__
 
 

@@ -134,6 +134,16 @@ def test_sensors_are_consistent_and_can_be_overridden(tmp_path, name):
     assert s.noise.tx_power_dbm == SENSORS[name]["noise"]["tx_power_dbm"]
 
 
+def test_one_key_of_a_sensors_chirp_can_be_stated(tmp_path):
+    """33 us at 20 MHz/us sweep 660 MHz. Planted bug: the stated chirp in place of the sensor's."""
+    scene = SCENE.replace("radio: {mode: fmcw, carrier_hz: 60.0e+9, chirps_per_frame: 48}\n", "")
+    (tmp_path / "scene.yaml").write_text(scene)
+    radio = load(
+        tmp_path / "scene.yaml", ["sensor=awr1843", "radio.chirp.slope_mhz_per_us=20"]
+    ).radio
+    assert (radio.chirp.idle_us, radio.bandwidth_hz) == (7, pytest.approx(660e6))
+
+
 @pytest.mark.parametrize(
     ("name", "height", "low"),
     [("awr1843", 0.5, 8), ("iwr6843", 0.5, 8), ("awr2944", 0.8, 12)],

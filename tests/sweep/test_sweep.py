@@ -199,11 +199,12 @@ def test_a_sweep_s_name_is_no_path(folder, name):
     [
         (
             "axes: {snr: {key: noise.snr, values: [1]}}",
-            "s.yaml:3: axes.snr: entry 0 of snr (noise.snr = 1): noise.snr: unknown key",
+            "s.yaml:3: axes.snr: entry 0 of snr (noise.snr = 1): noise.snr: unknown key; did you "
+            "mean snr_db?",
         ),
         (
             "axes: {snr: {key: noise.snr_db, values: [1, x]}}",
-            'entry 1 of snr (noise.snr_db = "x"): noise.snr_db: must be a valid number',
+            'entry 1 of snr (noise.snr_db = "x"): noise.snr_db: must be a number',
         ),
         (
             "axes: {a: {key: noise.snr_db, values: []}}",
@@ -373,8 +374,9 @@ def test_the_dataset_holds_each_points_summary(folder):
 
 
 def test_an_unfinished_sweep_can_be_read_and_a_failed_point_does_not_stop_it(folder, capsys):
-    """A UAV on top of the AT at one entry: recorded with its error; `--retry-failed` alone runs it
-    again."""
+    """A UAV on top of the AT at one entry: recorded with its error in one line, key first;
+    `--retry-failed` alone runs it again. Planted bug: str of pydantic's error, whose first line
+    says nothing."""
     text = (
         "scenario: base.yaml\nname: x\naxes:\n  y: {key: 'swarm.P1.position_m', values: [[0.3, "
         "0.2, 50.01], [0, 5, 50], [0, 6, 50]]}\n"
@@ -385,9 +387,8 @@ def test_an_unfinished_sweep_can_be_read_and_a_failed_point_does_not_stop_it(fol
     run_here(plan, out, points[:2])
     assert open_sweep(out).state.values.ravel().tolist() == [-1, 1, 0]
     found = status(out)
-    assert (found.total, found.done, found.failed) == (3, 1, 1) and "0.01 m apart" in found.errors[
-        0
-    ][1]
+    assert (found.total, found.done, found.failed) == (3, 1, 1)
+    assert found.errors[0][1].startswith("swarm.P1.position_m: A and P1 are 0.01 m apart")
     assert main(["sweep", "--status", str(out)]) == 0
     assert "1 of 3 points done, 1 failed, 1 to do" in capsys.readouterr().out
     outcomes = Outcomes(out)
