@@ -62,8 +62,23 @@ PANELS: dict[str, dict[Callable[..., None], str]] = {
 """The commands by panel of ``--help``, each with an example of its use."""
 
 
+def _untyped(params: Any) -> Any:
+    """Return options whose help shows no type where they are flags, which take no value."""
+    for param in params:
+        param.metavar = "" if getattr(param, "is_flag", False) else param.metavar
+    return params
+
+
+class _Command(typer.core.TyperCommand):
+    def get_params(self, ctx: Any) -> Any:
+        return _untyped(super().get_params(ctx))
+
+
 class _Commands(typer.core.TyperGroup):
     """The program's own commands, then those of other packages, which are imported when called."""
+
+    def get_params(self, ctx: Any) -> Any:
+        return _untyped(super().get_params(ctx))
 
     def list_commands(self, ctx: Any) -> list[str]:
         return [*super().list_commands(ctx), *sorted(registry.COMMANDS.installed())]
@@ -88,6 +103,7 @@ for _panel, _commands in PANELS.items():
             short_help=_text.split(". ")[0].rstrip(".") + ".",
             epilog=f"Example: isac-rt {_example}",
             rich_help_panel=_panel,
+            cls=_Command,
         )(_command)
 
 
@@ -191,7 +207,8 @@ def _main(arguments: Sequence[str]) -> int:
         if hasattr(problem, "exit_code"):  # typer's own: usage errors, exits and aborts
             text = problem.format_message() if hasattr(problem, "format_message") else ""
             if text:
-                _complain(f"{text} (see isac-rt --help)")
+                at = getattr(getattr(problem, "ctx", None), "command_path", "isac-rt")
+                _complain(f"{text} (see {at} --help)")
             return int(problem.exit_code)
         if isinstance(problem, UserError):
             _complain(str(problem))

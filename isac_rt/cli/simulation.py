@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -170,34 +170,12 @@ def _say_coverage(seen: Mapping[str, Any]) -> None:
 
 def _say_budget(rows: list[Any]) -> None:
     """The link budget as `isac_rt.frame.level.LinkBudget` rows."""
-    titles = (
-        "link budget",
-        "reference",
-        "distance [m]",
-        "received [dBm]",
-        "noise [dBm]",
-        "SNR [dB]",
-        "gain [dB]",
-        "processed [dB]",
-    )
-    values = [
-        (
-            b.distance_m,
-            b.received_dbm,
-            b.noise_dbm,
-            b.snr_db,
-            b.processing_gain_db,
-            b.processed_snr_db,
-        )
-        for b in rows
-    ]
-    say_table(
-        titles,
-        [
-            (b.link.replace("->", " to "), b.reference, *(f"{v:.1f}" for v in row))
-            for b, row in zip(rows, values, strict=True)
-        ],
-    )
+    heads = "link budget, reference, distance [m], received [dBm], noise [dBm], SNR [dB], gain [dB]"
+    made = []
+    for row in rows:
+        link, reference, *values = astuple(row)
+        made.append((link.replace("->", " to "), reference, *(f"{v:.1f}" for v in values)))
+    say_table([*heads.split(", "), "processed [dB]"], made)
 
 
 _PLAN_WORDS = (
@@ -260,27 +238,29 @@ def plan(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     overrides: Overrides = None,
 ) -> None:
-    """Show coverage, modelled and omitted effects and their estimated errors. Traces a few frames
-    only."""
+    """Show coverage, link budgets, modelled and omitted effects and their estimated errors. Traces
+    a few frames only."""
     from isac_rt.scenario.file import load
 
     loaded = load(scenario, overrides or ())
     with ending_soon_after_interrupt(Path()), working("tracing a few frames"):
         from isac_rt.simulation.audit import make_plan
-        from isac_rt.simulation.setup import prepare
+        from isac_rt.simulation.setup import link_budgets, prepare
 
         setup = prepare(loaded)
-        planned = make_plan(setup)
+        planned, budget = make_plan(setup), link_budgets(setup)
     if as_json:
-        typer.echo(json.dumps(planned | {"city": setup.city.record()}, indent=1))
+        beside = {"city": setup.city.record(), "link_budget": [asdict(row) for row in budget]}
+        typer.echo(json.dumps(planned | beside, indent=1))
     else:
         _say_city(setup.city.notes)
+        _say_coverage(planned["coverage"])
+        _say_budget(budget)
         _say_plan(planned)
 
 
 def _say_plan(planned: dict[str, Any]) -> None:
     """The plan of `isac_rt.simulation.audit.make_plan`."""
-    _say_coverage(planned["coverage"])
 
     def error(item: dict[str, Any]) -> str:
         value = item["estimate"]

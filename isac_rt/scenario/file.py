@@ -62,6 +62,8 @@ def load(
         document = Document.of_tree(path)
     else:
         document = Document(Path(path), "a scenario needs at least a swarm")
+        if re.fullmatch("[A-Za-z0-9_-]{1,100}", document.path.stem):
+            document.data.setdefault("name", document.path.stem)
     if without_removed:
         document.drop_removed(Scenario)
     for override in overrides:

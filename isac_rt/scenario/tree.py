@@ -59,7 +59,7 @@ class Scenario(Node):
 
     name: Name = "unnamed"
     """Name of the scenario, which titles results and names the folder they go to by default. It may
-    hold letters, digits, _ and - only."""
+    hold letters, digits, _ and - only. By default that of its file."""
     seed: Seed = 1
     """Number that all randomness follows from: the same seed gives the same bits, another seed
     another draw of noise, data and clutter. The default is as good as any other."""

@@ -374,6 +374,16 @@ def test_frames_and_seed_name_their_options(complaint):
     assert complaint(BASE, seed=-7).startswith("--seed -7: must be greater than or equal to 0")
 
 
+@pytest.mark.parametrize(
+    ("file", "name"), [("quarter-2.yaml", "quarter-2"), ("my b.yaml", "unnamed")]
+)
+def test_a_scenario_without_a_name_is_named_after_its_file(tmp_path, file, name):
+    """Two of them share no folder of results. Planted bug: `unnamed` for all."""
+    (tmp_path / file).write_text("swarm: {A: {role: active, position_m: [0, 0, 9]}}\n")
+    assert load(tmp_path / file).name == name
+    assert load(tmp_path / file, ["name=mine"]).name == "mine"
+
+
 def test_overrides_reach_into_the_tree(tmp_path):
     path = tmp_path / "s.yaml"
     path.write_text(BASE)

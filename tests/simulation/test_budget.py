@@ -60,7 +60,8 @@ def test_the_truth_of_a_flight_in_free_space_stays_within_the_bounds():
 
 
 def test_the_plan_on_the_command_line(capsys):
-    """Table and JSON of the same plan. Planted bug: the items printed without their links."""
+    """Table and JSON of the same plan, with the link budget. Planted bug: the items printed without
+    their links."""
     scene = str(SCENES / "paper_swarm.yaml")
     assert main(["plan", scene, "--json", "--set", "frames=4"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -70,6 +71,8 @@ def test_the_plan_on_the_command_line(capsys):
     for item in found["items"]:
         assert item["modelled"].split(",")[0][2:] in text
     assert "AT to PT1" in text
+    for row in found["link_budget"]:
+        assert f"{row['received_dbm']:.1f}" in text.split("processed [dB]")[1]
 
 
 def town(seed: int) -> Scenario:
