@@ -435,7 +435,7 @@ def _all(d: xr.Dataset, city: CityMesh | None, every: bool) -> Iterator[Drawing]
     yield Drawing("scene", [partial(scene_map, dataset=d, city=city)], 6.4)
     for s in range(snapshots) if every else [snapshots // 2][:snapshots]:
         yield from _maps(d, s, "range_doppler", range_doppler, 4.1)
-    if snapshots:  # every frame shows the same
+    if snapshots and d.modulated.values.any():  # every frame shows the same
         yield from _maps(d, snapshots // 2, "equivalent_range", equivalent_range, 3.2)
     for o in observers:
         of = ("range", "velocity", "azimuth")
@@ -448,7 +448,8 @@ def _all(d: xr.Dataset, city: CityMesh | None, every: bool) -> Iterator[Drawing]
         )
     for name, terminals in (("errors", False), ("errors_terminals", True)):
         draw = [partial(error_cdf, dataset=d, name=m, terminals=terminals) for m in MEASURES]
-        yield Drawing(name, draw, 3.5, 2)
+        if np.isfinite(d.detected_range.values[d.cooperative.values == terminals]).any():
+            yield Drawing(name, draw, 3.5, 2)
     if d.sizes["path"]:
         draw = [
             partial(path_power, dataset=d, observer=o, against=against)
@@ -506,18 +507,16 @@ def sweep_curves(
     axis `by`.
 
     A rate (a quantity with bounds beside it) is pooled over the repetitions and drawn with its
-    bounds, logarithmically; anything else is the mean over them. Of the axes that are neither of
-    the two the first entry is taken.
+    bounds, logarithmically if of errors; anything else is the mean over them. Of the axes that are
+    neither of the two the first entry is taken.
     """
     rate = f"{quantity}_low" in dataset
     values = dataset[f"{quantity}_pooled"] if rate else dataset[quantity].mean("repetition")
     rest = {d: 0 for d in values.dims if d not in (against, by, "link")}
     values = values.isel(rest)
-    x = (
-        np.arange(values.sizes[against])
-        if values[against].dtype == object
-        else values[against].values
-    )
+    x = values[against].values
+    if x.dtype == object:
+        x = np.arange(x.size)
     curve = 0
     for link in values.link.values:
         for entry in values[by].values if by else [None]:
@@ -525,10 +524,7 @@ def sweep_curves(
             y = values.sel(where).values
             if not np.isfinite(y).any():
                 continue
-            colour, label = (
-                colour_of(curve),
-                f"{link}" + (f", {by} {entry}" if by else ""),
-            )
+            colour, label = colour_of(curve), f"{link}" + (f", {by} {entry}" if by else "")
             ax.plot(x, np.maximum(y, 1e-9) if rate else y, "o-", ms=3.5, color=colour, label=label)
             if rate:
                 low, high = (
@@ -537,7 +533,9 @@ def sweep_curves(
                 )
                 ax.fill_between(x, np.maximum(low, 1e-9), high, color=colour, alpha=0.15, lw=0)
             curve += 1
-    if rate:
+    if rate and quantity.endswith("_rate"):
+        ax.set(ylim=(0, 1.05))
+    elif rate:
         positive = values.values[values.values > 0]
         ax.set(yscale="log", ylim=(0.5 * positive.min() if positive.size else 1e-4, 1.5))
     if values[against].dtype == object:

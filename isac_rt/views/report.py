@@ -161,6 +161,7 @@ def write_report(
         roles=", ".join(_count(roles.count(r), _ROLES.get(r, r)) for r in dict.fromkeys(roles)),
         carrier=" and ".join(f"{radio.carrier_hz / 1e9:g} GHz" for radio in radios),
         bandwidth=" and ".join(f"{radio.bandwidth_hz / 1e6:g} MHz" for radio in radios),
+        in_turn=any((radio.mode, radio.scheme) == ("fmcw", "tdm") for radio in radios),
         tables=tables,
         coverage=json.loads(d.attrs.get("coverage", "null")),
         walls=wall_table(d, city) if city is not None and "det_face" in d else Table((), ()),

@@ -53,7 +53,8 @@ LEGEND = {
     "channels by the true scatterers.",
     "SNR [dB]": "SNR: mean of the matched filter. Windows, straddling, clutter: mean losses by "
     "Hann windows, between cells, and to clutter after whitening.",
-    "False alarms": "False alarms: detections per frame that no path explains.",
+    "False alarms": "False alarms: detections per frame that no path explains, at "
+    "update_false_alarm_rate where that is set.",
     "GOSPA [m]": "GOSPA (p = 2, alpha = 2, c = 5 m): distance of the confirmed tracks from the "
     "targets; above \u201cNo tracks\u201d they are worse than none.",
     "n": "n: estimates caused by the UAV's own path within three resolution cells, the base of the "

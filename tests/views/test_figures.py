@@ -65,6 +65,26 @@ def test_all_figures_are_there_and_hold_ink(written):
         assert min(pixels.shape[:2]) > 200
 
 
+def test_what_has_nothing_to_show_is_not_drawn(run):
+    """Errors without an estimate, delay symbols of a plain radar. Planted bugs: empty axes; the
+    equivalent range of frames without data."""
+    empty = run.dataset.assign(
+        detected_range=run.dataset.detected_range * np.nan, modulated=run.dataset.modulated & False
+    )
+    names = {drawing.name for drawing in figures._all(empty, None, False)}
+    assert not names & {"errors", "errors_terminals", "equivalent_range_0002"}
+    assert "range_doppler_0002" in names
+
+
+@pytest.mark.parametrize(("quantity", "scale"), [("hit_rate", "linear"), ("ber", "log")])
+def test_error_rates_of_a_sweep_are_logarithmic_and_shares_are_not(quantity, scale):
+    """Planted bug: a share of 0.2 to 1 over decades."""
+    rate = xr.DataArray([[0.2], [1.0]], dims=("x", "link"))
+    rates = {f"{quantity}_{end}": rate for end in ("pooled", "low", "high")}
+    d = xr.Dataset(rates, {"x": [1, 2], "link": ["A->A"]}, {"axis_x": "key"})
+    assert figures.sweep_curves(Figure().subplots(), d, quantity, "x").get_yscale() == scale
+
+
 def test_axes_of_one_figure_name_alike_once_and_write_one_time_axis(run):
     """Planted bugs: a legend on every axis; a time axis that none shares."""
     drawing = next(d for d in figures._all(run.dataset, None, False) if d.name == "tracks_AT")
