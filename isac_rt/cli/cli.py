@@ -217,10 +217,8 @@ def _main(arguments: Sequence[str]) -> int:
             message = str(problem) or "there is no more memory"
             _complain(f"{type(problem).__name__}: {message} (the machine's disk or memory)")
             return 2
-        _complain(
-            f"{type(problem).__name__}: {problem} (this is a fault of isac_rt; {DEBUG}=1 shows "
-            "where)"
-        )
+        text = f"{type(problem).__name__}: {problem}"
+        _complain(f"{text} (this is a fault of isac_rt; {DEBUG}=1 shows where)")
         return 1
 
 

@@ -56,7 +56,7 @@ def new(
             "--footprints",
             metavar="FILE|NAME",
             help="Buildings (GeoJSON, CityJSON, GeoPackage, Shapefile, OpenStreetMap), a mesh, "
-            "Mitsuba's XML, or a scene of Sionna RT such as munich.",
+            "Mitsuba's XML, blocks for a generated grid, or a scene of Sionna RT such as munich.",
         ),
     ] = None,
     crs: Annotated[

@@ -90,7 +90,7 @@ def demo(
     if not scenario.exists():
         write_starter(scenario)
     run(scenario, out / "results", frames=12, overwrite=True)
-    say(f"next: change {scenario}, then isac-rt run {scenario}")
+    say(f"next: change {scenario}, of which 12 frames were run, then isac-rt run {scenario}")
 
 
 def _run(loaded: Scenario, folder: Path, snapshots: int, check_budget: bool, restart: bool) -> None:

@@ -28,7 +28,7 @@ from isac_rt.world.settings import City
 
 SCHEMA = "scenario.schema.json"
 _CANYON = """\
-  source: canyon                  # others: builtin, mitsuba, mesh, footprints, blocks
+  source: canyon                  # others: blocks, builtin, mitsuba, mesh, footprints
   street_width_m: 24
   building_height_m: 18
   street_length_m: 120"""
@@ -48,7 +48,7 @@ class Wanted:
     ----------
     city : str, optional
         File of buildings, of a mesh or of Mitsuba, or the name of a scene of Sionna RT; None: a
-        street canyon.
+        street canyon. `blocks` is a grid of blocks.
     crs, terrain : optional
         Coordinate reference system of a map that does not say it, GeoTIFF of heights.
     formation : str, optional
@@ -216,6 +216,8 @@ def _keys(wanted: Wanted, folder: Path) -> dict[str, str]:
     source = "mitsuba" if suffix == ".xml" else "mesh" if suffix in MESHES else "footprints"
     if (named or source != "footprints") and (wanted.crs or wanted.terrain):
         raise ResultsError(f"--crs and --terrain are of maps, not of {path.name}; leave them out")
+    if named and path.name == "blocks":
+        return {"source": "blocks"}
     if named:
         builtin_path(path.name)  # refuses what is none
         return {"source": "builtin", "name": path.name}
@@ -249,6 +251,8 @@ def _over(wanted: Wanted, file: Path) -> str:
             origin = point_in_file(node, Path(keys["file"]), origin)
         x, y, z = origin.tolist()
         lines.append(f"  origin: [{x!r}, {y!r}, {z:g}]  # of the world, in coordinates of the file")
+    if node.source == "blocks":
+        lines += ["  # blocks_x, blocks_y, block_size_m, street_width_m, building_height_m, ..."]
     if node.source == "footprints":
         lines += ["  height_property: height         # of each building in the file [m]"]
         lines += ["  default_height_m: 10            # where neither it nor storeys are known"]

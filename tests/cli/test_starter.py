@@ -212,7 +212,7 @@ def test_a_formation_has_as_many_targets_as_asked_for(formation, tmp_path):
 
 def test_a_sensor_and_other_cities(tmp_path, capsys):
     """A sensor has no passive terminal and none of the data's keys; a mesh in UTM gets an origin
-    near the swarm. Planted bug: the origin of a mesh left out."""
+    near the swarm; blocks are generated. Planted bug: the origin of a mesh left out."""
     write_starter(tmp_path / "s.yaml", Wanted(sensor="awr1843"))
     scenario = load(tmp_path / "s.yaml")
     assert scenario.radio.mode == "fmcw" and [*scenario.swarm] == ["AT", "U1"]
@@ -228,6 +228,8 @@ def test_a_sensor_and_other_cities(tmp_path, capsys):
     assert np.abs(swarm_of(scenario).poses(0.0)["AT"].position).max() < 150
     write_starter(tmp_path / "b.yaml", Wanted("simple_street_canyon"))
     assert load(tmp_path / "b.yaml").city.name == "simple_street_canyon"
+    write_starter(tmp_path / "g.yaml", Wanted("blocks"))
+    assert city_of(load(tmp_path / "g.yaml")).num_faces > 0
     for options, said in (
         (["--city", "nowhere"], "there are box, "),
         (["--city", "no.xml"], "--city no.xml: there is no such file"),
