@@ -12,7 +12,8 @@
 # `Reception`. Replacing it leaves tracking, scoring and figures as they are.
 
 # %% [markdown]
-# This active terminal keeps only detections with an SNR above 14 dB:
+# This active terminal keeps only detections with an SNR above 14 dB, of those that a CFAR with
+# many false alarms finds:
 
 # %%
 from dataclasses import replace
@@ -40,7 +41,12 @@ def terminal(setup, link):
 
 scenario = irt.load(
     "../scenes/street_canyon.yaml",
-    ["clutter.model=none", "modulation.acquisition_frames=1", "receiver_preset=plain"],
+    [
+        "clutter.model=none",
+        "modulation.acquisition_frames=1",
+        "receiver_preset=plain",
+        "receivers.false_alarm_rate=1e-3",
+    ],
     frames=4,
 )
 for name, receiver in (("standard", irt.standard_terminal), ("cautious", terminal)):
@@ -51,7 +57,7 @@ for name, receiver in (("standard", irt.standard_terminal), ("cautious", termina
     )
 
 # %% [markdown]
-# Samples can be exported for other receivers, for example as SigMF:
+# Samples can be saved for other receivers, as NetCDF here, or by `irt.write_sigmf`:
 
 # %%
 setup = irt.prepare(scenario)
