@@ -46,7 +46,7 @@ class LinkCoverage:
         where the array does not observe them
     field_of_view_deg : to each side of the boresight
     unambiguous_angle_deg : to each side; directions beyond it alias
-    bit_rate_bps : mean over the run, pilots and pauses included; None for echoes
+    bit_rate_bps : mean to the end of the last frame, pilots and pauses in; None for echoes
     """
 
     link: str
@@ -184,10 +184,9 @@ def _degrees(sine: float) -> float:
 def _bit_rate(link: Link, timetable: Timetable) -> float:
     groups, order = timetable.groups(link), timetable.modulation.dpsk_order
     w = timetable.waveform if groups is None else timetable.waveform.of_groups(groups)
-    carried = sum(
-        timetable.modulated(f) for f in range(timetable.frames) if link in timetable.links(f)
-    )
-    return w.payload_bits(order) * carried / (timetable.frames * timetable.interval)
+    frames, after_first = timetable.frames, (timetable.frames - 1) * timetable.interval
+    carried = sum(timetable.modulated(f) for f in range(frames) if link in timetable.links(f))
+    return w.payload_bits(order) * carried / (after_first + w.frame_duration)
 
 
 class _Flight(NamedTuple):

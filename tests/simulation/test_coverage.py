@@ -87,7 +87,7 @@ def test_limits_follow_from_the_settings():
     # frames 2, 3, 5, 6, 7, 9 and 10 carry 6 bits by delay in every chirp and 2 by phase but in the
     # first of each antenna, but for the check sum
     bits = 3 * (CHIRPS * 6 + (CHIRPS - 3) * 2) - 8
-    assert seen.links[1].bit_rate_bps == pytest.approx(7 * bits / 1.1, rel=1e-12)
+    assert seen.links[1].bit_rate_bps == pytest.approx(7 * bits / (1.0 + CHIRPS * SLOT), rel=1e-12)
     assert seen.links[0].bit_rate_bps is None
 
 
@@ -100,7 +100,7 @@ def test_schedules_and_streams():
     assert own.max_velocity_mps == pytest.approx(C / MIDDLE / 2 / SLOT / 2, rel=1e-9)
     assert other.max_velocity_mps == pytest.approx(C / MIDDLE / SLOT / 2 / 3, rel=1e-9)
     bits = CHIRPS * 6 + (CHIRPS - 3) * 3 - 8
-    assert other.bit_rate_bps == pytest.approx(9 * bits / 1.1, rel=1e-12)
+    assert other.bit_rate_bps == pytest.approx(9 * bits / (1.0 + CHIRPS * SLOT), rel=1e-12)
 
 
 def test_frames_outside_by_hand():
