@@ -477,7 +477,7 @@ def _samples(
     d = results.dataset
     names = [str(name) for name in d.observer.values]
     if observer is not None:
-        check_names([observer], names, "observer")
+        check_names([observer], names, "link")
     if frame is not None:
         check_frame(results.scenario, frame)
     frames = range(d.sizes["frame"]) if frame is None else [frame]

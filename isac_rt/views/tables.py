@@ -46,7 +46,8 @@ LEGEND = {
     "cells on every axis and 5 m.",
     "False tracks per frame": "False tracks: confirmed tracks that track no UAV, 5 m or more "
     "from every one.",
-    "Noise only": "Noise only: mean detection probability of this detector in noise alone.",
+    "Noise only": "Noise only: mean detection probability of this kind of detector in noise alone, "
+    "by one test in the target's direction; a search over directions finds less.",
     "Matched filter": "Matched filter: that of a filter at the true range, velocity and direction; "
     "no receiver finds more.",
     "Known clutter": "Known clutter: that of a detector in the target's cell that whitens the "
@@ -62,8 +63,7 @@ LEGEND = {
     "City loss": "City loss: noise-only detection probability less the share found. Other columns "
     "by cause: target-frames that were lost.",
     "Switches": "In view, found, tracked: frames; switches: to another track.",
-    "Too weak": "Too weak: under 13 dB for a matched filter coherent over samples, chirps and "
-    "antennas.",
+    "Too weak": "Too weak: under 13 dB for a matched filter over samples, chirps and antennas.",
     "Not decoded": "Not decoded: the frame's data were erased or wrong.",
     "Inaccurate": "Inaccurate: over one resolution cell off.",
     "Noise": "Noise: below the threshold of a detector that adds the channels' powers.",
