@@ -242,7 +242,7 @@ MAX_LINES = {
     "propagation": 4789,
     "signal": 837,
     "receive": 6083,
-    "track": 1949,
+    "track": 1975,
     "scenario": 2213,
     "results": 3745,
     "simulation": 3779,

@@ -41,6 +41,9 @@ class Tracking(Node):
     """Time without a detection after which a confirmed track ends, whatever `drop_misses` says [s];
     one that was seen for less long ends after as many frames as it was seen in. null, the default:
     only `drop_misses` counts."""
+    target_size_m: Annotated[float, Field(ge=0, le=100)] = 0.0
+    """Extent of the largest targets [m], such as 6 of cars: of detections nearer to each other only
+    the strongest counts, and a track expects it anywhere on its target. By default 0: points."""
     initiation: Literal["all", "unexplained"] = "all"
     """Detections that start tracks. `all`, the default. `unexplained`: not those that the city
     explains, as images of terminals or UAVs, surfaces, or static clutter that the mesh lacks;

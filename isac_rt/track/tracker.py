@@ -26,6 +26,7 @@ from isac_rt.track.filter import (
     narrowed,
     predict,
     reported,
+    resting,
     update,
 )
 from isac_rt.track.settings import Tracking
@@ -53,6 +54,24 @@ def in_plane(detections: Detections) -> Detections:
     std = detections.std.copy()
     std[:, 2:][unseen] = FLAT_STD
     return replace(detections, direction=np.where(unseen, 0.0, detections.direction), std=std)
+
+
+def spread(detections: Detections, size: float) -> np.ndarray:
+    """Return deviations (Q, 4) of detections that lie anywhere on a target of some size [m]."""
+    std, of_place = detections.std.copy(), size / np.sqrt(12)
+    std[:, 0] = np.hypot(std[:, 0], of_place)
+    std[:, 2:] = np.hypot(std[:, 2:], of_place / detections.range[:, None])
+    return std
+
+
+def strongest(rows: Sequence[int], places: np.ndarray, snr: np.ndarray, size: float) -> list[int]:
+    """Return rows of detections without those that are nearer than `size` [m] to a stronger one, by
+    their places (Q, 3)."""
+    out: list[int] = []
+    for q in sorted(rows, key=lambda q: -snr[q]):
+        if not (np.linalg.norm(places[out] - places[q], axis=1) < size).any():
+            out.append(q)
+    return out
 
 
 def assign(cost: np.ndarray) -> list[tuple[int, int]]:
@@ -247,9 +266,13 @@ class Tracker(Stateful):
         Detections that are a PT's reference are passed over. With a transmitter all are taken as
         bistatic.
         """
-        z = detections.measured
+        z, std, size = detections.measured, detections.std, self.settings.target_size_m
         free = [int(q) for q in np.flatnonzero(~detections.is_reference)]
-        cost = self._costs(z, detections.std, own, transmitter)
+        if size:
+            sender = None if transmitter is None else transmitter.mean
+            free = strongest(free, resting(z, own, sender)[:, :3], detections.snr, size)
+            std = spread(detections, size)
+        cost = self._costs(z, std, own, transmitter)
         hit: dict[int, int] = {}
         for confirmed in (True, False):
             rows = [k for k, t in enumerate(self.tracks) if t.confirmed is confirmed]
@@ -265,7 +288,7 @@ class Tracker(Stateful):
                 track.snr, track.detection = float(detections.snr[q]), q
                 track.last = self.state.time
         self._one_reading_each()
-        self._condition(hit, z, detections.std, own, transmitter)
+        self._condition(hit, z, std, own, transmitter)
         self.state.tracks = [t for t in self.tracks if not self._dead(t)]
         free = [q for q in free if detections.starts[q]]
         which, states = initiate_all(

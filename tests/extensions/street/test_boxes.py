@@ -322,3 +322,20 @@ def test_the_street_has_its_numbers():
     assert radar["in_view"] == 20 and 0.45 <= radar["hit_rate"] <= 0.65
     assert 3 < radar["object_tracks_per_frame"] < 7
     assert radar["false_tracks_per_frame"] < 0.7
+
+
+@pytest.mark.slow
+@pytest.mark.sionna
+def test_a_street_with_sumos_traffic_has_its_numbers():
+    """Five vehicles and a walker of the file, one seed: most of AT's tracks are of objects,
+    and PT1 decodes all. Planted bug: objects' tracks counted as false."""
+    scenario = irt.load(SCENES / "traffic_swarm.yaml")
+    objects = [name for name, uav in scenario.swarm.items() if uav.role == "object"]
+    assert objects == [f"street_{n}" for n in ("bus1", "car1", "car2", "car3", "van1", "walker1")]
+    figures = irt.run(scenario, snapshots=0, progress=False).summary["terminals"]
+    at, pt = figures["AT"], figures["PT1"]
+    assert at["hit_rate"] == pytest.approx(0.75, abs=0.13)
+    assert pt["hit_rate"] == 1 and pt["ser_dpsk"] == pt["ser_delay"] == 0
+    assert max(at["false_tracks_per_frame"], pt["false_tracks_per_frame"]) < 1.5
+    assert at["object_tracks_per_frame"] == pytest.approx(11, abs=4)
+    assert pt["object_tracks_per_frame"] == pytest.approx(7, abs=2)

@@ -210,18 +210,39 @@ def test_a_pedestrian_walks_at_the_speed_of_the_flight():
     assert 100 < 120 * walker.rate / (2 * np.pi) < 120  # steps a minute, as adults walk
 
 
+SMALL = {"extent": {"kind": "uav", "size_m": (0.4, 0.4, 0.15)}, "rotors": {}}
+
+
 @pytest.mark.parametrize(
-    ("kind", "place", "speed", "found"),
-    [("vehicle", (2, 22, 1), 3, 9), ("pedestrian", (1, 8, 1), 1, 5)],
+    ("body", "place", "speed", "size"),
+    [
+        ({"extent": {"kind": "vehicle"}}, (2, 22, 1), 3, 6.0),
+        ({"extent": {"kind": "pedestrian"}}, (1, 8, 1), 1, 1.0),
+        ({"extent": {"kind": "agv"}}, (1, 12, 1), 2, 0.6),
+        ({"extent": {"kind": "uav"}}, (1, 8, 3), 3, 2.0),
+        (SMALL, (1, 12, 2), 3, 0.5),
+    ],
+    ids=["vehicle", "pedestrian", "agv", "uav", "rotors"],
 )
-def test_a_target_with_extent_is_one_track(kind, place, speed, found):
-    """Regression: of ten frames; one track at most. Planted bug: each centre at ten times its
-    place."""
-    target = {"position_m": place, "velocity_mps": (0, -speed, 0), "extent": {"kind": kind}}
-    run = irt.run(scene(target, frames=10, chirps=96), progress=False)
-    figures = run.summary["terminals"]["radar"]
-    assert figures["targets"]["T"]["found"] >= found
-    assert figures["false_tracks_per_frame"] < 0.2
+def test_a_target_with_extent_is_one_track(body, place, speed, size):
+    """Regression: of 20 frames, and of the vehicle three tracks as a point. Planted bugs: each
+    centre at ten times its place; all detections kept; `spread` by nothing."""
+    target = {"position_m": place, "velocity_mps": (0, -speed, 0)} | body
+    points = scene(target, frames=20, chirps=96)
+    tree = points.model_dump(mode="json") | {"tracking": {"target_size_m": size}}
+    run = irt.run(type(points).model_validate(tree), progress=False, snapshots=0)
+    tracks = tracks_by_frame(run.dataset)
+    assert tracks.tolist()[5:] == [1] * 15
+    assert tracks.max() == 1
+    assert run.summary["terminals"]["radar"]["false_tracks_per_frame"] == 0
+    if size > 5:
+        assert tracks_by_frame(irt.run(points, progress=False, snapshots=0).dataset).max() > 2
+
+
+def tracks_by_frame(dataset):
+    """Confirmed tracks in each frame."""
+    confirmed = dataset.track_confirmed.values.astype(bool)
+    return np.bincount(dataset.track_frame.values[confirmed], minlength=dataset.sizes["frame"])
 
 
 @pytest.mark.parametrize(
