@@ -73,3 +73,23 @@ def test_type_checkers_see_types(tmp_path):
     assert 'Revealed type is "isac_rt.scenario.tree.Scenario"' in done.stdout, done.stdout
     assert "-> isac_rt.results.recorder.Results" in done.stdout, done.stdout
     assert 'Module has no attribute "lod"' in done.stdout, done.stdout
+
+
+def test_wrong_calls_say_what_to_give():
+    """Planted bugs: a frame that the run has not is traced; names to keep that do nothing; an
+    attribute error for a path; an override's letters taken for overrides."""
+    target = {"role": "target", "position_m": [0, 20, 9]}
+    tree = {
+        "sensor": "awr1843",
+        "swarm": {"A": {"role": "active", "position_m": [0, 0, 9]}, "T": target},
+    }
+    scenario = isac_rt.load(tree, "frames=2")
+    setup = isac_rt.prepare(scenario)
+    for number in (-1, 2):
+        with pytest.raises(ValueError, match=f"frame {number}: there are 0 to 1"):
+            setup.frame(number)
+    assert repr(setup.frame(1)) == "<Frame 1: A->A>"
+    with pytest.raises(ValueError, match="keep: sample: there is samples alone"):
+        isac_rt.run(scenario, setup=setup, keep=["sample"])
+    with pytest.raises(TypeError, match=r"irt\.load"):
+        isac_rt.run("scene.yaml")

@@ -66,7 +66,7 @@ def load(
             document.data.setdefault("name", document.path.stem)
     if without_removed:
         document.drop_removed(Scenario)
-    for override in overrides:
+    for override in [overrides] if isinstance(overrides, str) else overrides:
         document.override(override)
     for name, value in (("frames", frames), ("seed", seed)):
         if value is not None:

@@ -104,11 +104,7 @@ class Coverage:
 
 
 def coverage(
-    swarm: Swarm,
-    timetable: Timetable,
-    arrays: Arrays,
-    receivers: Receivers,
-    schedule: str,
+    swarm: Swarm, timetable: Timetable, arrays: Arrays, receivers: Receivers, schedule: str
 ) -> Coverage:
     """Return the coverage of every link of a run, and the part of the swarm outside it.
 
@@ -130,11 +126,7 @@ def coverage(
         flown = {name: flight.at(here) for name, flight in flights.items()}
         rows = (_outside(link, name, flown, arrays, seen) for name in flown if name != link.rx)
         outside += [row for row in rows if row.unseen or row.too_fast]
-    return Coverage(
-        frame_interval_s=timetable.interval,
-        links=tuple(links),
-        outside=tuple(outside),
-    )
+    return Coverage(frame_interval_s=timetable.interval, links=tuple(links), outside=tuple(outside))
 
 
 def unambiguous_velocity(

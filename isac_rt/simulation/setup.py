@@ -108,6 +108,9 @@ class Frame:
     _by_chirp: Mapping[str, Frame] = field(default_factory=dict, repr=False)
     """The frame as the radars of each chirp have it, by transmitter; empty where all share one."""
 
+    def __repr__(self) -> str:
+        return f"<Frame {self.number}: {', '.join(map(str, self.paths))}>"
+
     def sent_by(self, schedules: Mapping[str, Schedule]) -> Frame:
         """Return the frame with other antenna schedules of some active terminals."""
         s = self._setup
@@ -256,6 +259,9 @@ class Setup:
     by_chirp: tuple[Setup, ...] = ()
     """Set-ups of the radars of each chirp if they do not share one; chirp, paths and plan above are
     then those of the first."""
+
+    def __repr__(self) -> str:
+        return f"<Setup of {self.scenario.name}: {', '.join(map(str, self.timetable.links(0)))}>"
 
     @property
     def each(self) -> tuple[Setup, ...]:
@@ -424,7 +430,14 @@ class Setup:
         return _noise_power(self.scenario, self.waveform, self.reference, poses, link)
 
     def frame(self, number: int) -> Frame:
-        """Trace a frame, with the schedule of the scenario."""
+        """Trace a frame, with the schedule of the scenario.
+
+        Raises
+        ------
+        ValueError  If the scenario has no such frame.
+        """
+        if not 0 <= number < self.timetable.frames:
+            raise ValueError(f"frame {number}: there are 0 to {self.timetable.frames - 1}")
         if self.by_chirp:
             return self._joint_frame(number)
         poses, traced = self._traced(number)
@@ -722,11 +735,7 @@ def _believed_city(scenario: Scenario, city: CityMesh) -> CityMesh:
 
 
 def _noise_power(
-    scenario: Scenario,
-    waveform: Waveform,
-    reference: FreeSpace,
-    poses: dict[str, Pose],
-    link: Link,
+    scenario: Scenario, waveform: Waveform, reference: FreeSpace, poses: dict[str, Pose], link: Link
 ) -> float:
     noise, rise = scenario.noise_of(link.rx), scenario.clutter.noise_rise
     if noise.model == "link_budget":

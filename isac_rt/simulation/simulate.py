@@ -90,6 +90,8 @@ def run(
     >>> results.summary["terminals"]["PT1"]["ser_delay"]
     0.0
     """
+    if not isinstance(scenario, Scenario):
+        raise TypeError("irt.run takes a scenario: irt.run(irt.load(path))")
     run = _Run.begin(scenario, setup, snapshots, terminal)
     samples: dict[tuple[int, Link], IFCube] = {}
 
@@ -98,7 +100,9 @@ def run(
 
     if callable(keep):
         run.observe = keep
-    elif "samples" in keep:
+    elif unknown := {*([keep] if isinstance(keep, str) else keep)} - {"samples"}:
+        raise ValueError(f"keep: {', '.join(map(str, unknown))}: there is samples alone")
+    elif keep:
         run.observe = add
     with followed(progress, scenario.frames) as report:
         run.fly(report, threads, resume)

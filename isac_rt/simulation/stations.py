@@ -80,11 +80,7 @@ class Station:
         """Processor time of reception and tracking so far."""
 
     def receive(
-        self,
-        frame: Frame,
-        cube: IFCube,
-        maps: bool,
-        reports: Sequence[ReportedUav] = (),
+        self, frame: Frame, cube: IFCube, maps: bool, reports: Sequence[ReportedUav] = ()
     ) -> LinkResult:
         """Receive one frame and track, with targets reported by other terminals. Runs in a worker
         thread and changes the state of this station only."""
