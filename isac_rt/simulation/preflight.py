@@ -24,7 +24,7 @@ from isac_rt.simulation.coverage import Coverage, Outside, unambiguous_velocity
 from isac_rt.world.city.georeference import local_origin
 from isac_rt.world.city.mesh import CityMesh, empty_city
 from isac_rt.world.city.meshfiles import point_in_file
-from isac_rt.world.passage import TOUCH_M, enclosed, first_passage, obstacles
+from isac_rt.world.passage import TOUCH_M, enclosed, first_passage, hits, obstacles
 from isac_rt.world.settings import City
 from isac_rt.world.swarm import Pose, Swarm
 
@@ -185,9 +185,12 @@ def check_passage(swarm: Swarm, timetable: Timetable, city: CityMesh) -> None:
         polyline = points - city.origin
         keys = "waypoints" if swarm.uavs[name].waypoints else "position_m or velocity_mps"
         if enclosed(solid, polyline[0]):
+            up = np.array([1e-5, 2e-5, 1.0]) * (city.bounds()[1][2] + 1 - polyline[0, 2])
+            shares = hits(city.corners, polyline[0], polyline[0] + up)[1]
+            roof = points[0, 2] + up[2] * shares.max(initial=0.0)
             raise ScenarioError(
                 f"swarm.{name}: starts inside a building of {city.name} or under its ground, at "
-                f"{_said(points[0])} m; change its {keys}{remedy}"
+                f"{_said(points[0])} m, under a surface at {roof:.1f} m; change its {keys}{remedy}"
             )
         found = first_passage(city, _off_the_ends(polyline))
         if found is not None:

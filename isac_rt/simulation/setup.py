@@ -289,19 +289,14 @@ class Setup:
         arrays = Arrays(antennas)
         free = replace(self.reference, arrays=arrays)
         plan = replace(self.plan, arrays=arrays)
-        floor = noise_floor(self.scenario, plan, free)
+        s, floor = self.scenario, noise_floor(self.scenario, plan, free)
         return replace(
             self,
             arrays=arrays,
             reference=free,
             plan=plan,
-            propagation=_extended(
-                self.scenario,
-                _maker(self.scenario, plan, free, self.city, floor)(),
-                free,
-                self.city,
-            ),
-            expectation=_expectation_of(self.scenario, plan, free, self.believed_city),
+            propagation=_extended(s, _maker(s, plan, free, self.city, floor)(), free, self.city),
+            expectation=_expectation_of(s, plan, free, self.believed_city),
         )
 
     @property

@@ -252,8 +252,12 @@ def test_a_room_has_its_limits(tmp_path, meshes, person, said):
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        ("swarm.U1.position_m=[-14.2, -4.9, 10.1]", "starts inside a building of canyon"),
+        (
+            "swarm.U1.position_m=[-14.2, -4.9, 10.1]",
+            "at [-14.2, -4.9, 10.1] m, under a surface at 18",
+        ),
         ("swarm.U1.position_m=[-1.3, -4.9, -2.1]", "or under its ground, at [-1.3, -4.9, -2.1] m"),
+        ("swarm.U1.position_m=[-1.3, -4.9, -2.1]", "under a surface at 0.0 m; change"),
         (
             "swarm.U1.velocity_mps=[-43, 9.7, 0.3]",
             "flies through a surface of canyon (concrete) at",
