@@ -111,7 +111,7 @@ def _say_status(folder: Path) -> None:
     state = status(folder)
     left = state.total - state.done - state.failed
     say(f"{state.done} of {state.total} points done, {state.failed} failed, {left} to do")
-    say(*(f"  failed at {list(index)}: {error.splitlines()[0]}" for index, error in state.errors))
+    say(*(f"  failed at {place}: {error.splitlines()[0]}" for place, error in state.errors))
     if state.failed:
         say("  --retry-failed runs them again")
     for count, cause in (

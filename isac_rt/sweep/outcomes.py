@@ -158,7 +158,7 @@ class Status:
     Attributes
     ----------
     total, done, failed : points
-    errors : of those that failed (index along the axes, message)
+    errors : of those that failed (entries of the axes in words, message)
     other_version, other_scenario : points in the folder that another version of the program or of
         its packages made, and those of other values of the scenario; neither is used
     """
@@ -166,7 +166,7 @@ class Status:
     total: int
     done: int
     failed: int
-    errors: list[tuple[tuple[int, ...], str]]
+    errors: list[tuple[str, str]]
     other_version: int
     other_scenario: int
 
@@ -176,7 +176,7 @@ def status(folder: Path | str) -> Status:
     outcomes = Outcomes(Path(folder))
     plan = outcomes.definition()
     done, failed = 0, 0
-    errors: list[tuple[tuple[int, ...], str]] = []
+    errors: list[tuple[str, str]] = []
     keys = set()
     for point in plan.points():
         keys.add(point.key)
@@ -188,7 +188,10 @@ def status(folder: Path | str) -> Status:
         else:
             failed += 1
             if len(errors) < 20:
-                errors.append((point.index, outcome["error"]))
+                entries = zip(plan.sweep.axes.items(), point.index, strict=False)
+                at = [f"{name} {axis.labels()[i]}" for (name, axis), i in entries]
+                at += [f"repetition {point.index[-1]}"] if plan.sweep.repetitions > 1 else []
+                errors.append((", ".join(at), outcome["error"]))
     return Status(plan.sweep.num_points, done, failed, errors, *outcomes.others(keys))
 
 

@@ -388,6 +388,7 @@ def test_an_unfinished_sweep_can_be_read_and_a_failed_point_does_not_stop_it(fol
     assert open_sweep(out).state.values.ravel().tolist() == [-1, 1, 0]
     found = status(out)
     assert (found.total, found.done, found.failed) == (3, 1, 1)
+    assert found.errors[0][0] == "y [0.3, 0.2, 50.01]"
     assert found.errors[0][1].startswith("swarm.P1.position_m: A and P1 are 0.01 m apart")
     assert main(["sweep", "--status", str(out)]) == 0
     assert "1 of 3 points done, 1 failed, 1 to do" in capsys.readouterr().out
