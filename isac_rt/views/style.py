@@ -99,8 +99,8 @@ def labelled(ax: Axes, x: str, y: str, title: str = "", **legend: Any) -> Axes:
     spec, settings = ax.get_subplotspec(), matplotlib.rcParams
     if figure.get_layout_engine() is None or spec is None:
         width = ax.get_window_extent().width
-    else:  # the layout comes later: leave an inch for the labels, and more for a colour bar
-        used = 1.7 if ax.images else 1.0
+    else:  # the layout comes later: leave room for labels and colour bar, of the letters' size
+        used = (1.7 if ax.images else 1.0) * settings["font.size"] / STYLE["font.size"]
         width = figure.bbox.width / spec.get_gridspec().ncols - used * figure.dpi
     for columns in range(len(names), 0, -1):
         made = ax.legend(
