@@ -28,9 +28,10 @@ HIPS_M = 0.93
 PERSON: Mapping[str, Any] = {
     "box": None,
     "extent": {"kind": "pedestrian"},
-    "rcs": {"model": "constant", "value_dbsm": -1.37},
+    "rcs": {"model": "constant", "value_dbsm": -1.37, "fluctuation_db": 3.94},
 }
-"""Person, of the cross-section of TR 38.901 (v19), in place of what is stated for vehicles."""
+"""Person, of the cross-section of TR 38.901 (v19) with its random component, in place of what is
+stated for vehicles."""
 ToWorld = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 

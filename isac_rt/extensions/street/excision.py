@@ -30,11 +30,17 @@ def excised(cube: IFCube, rate: float) -> IFCube:
     """
     samples, size = cube.samples, cube.waveform.num_samples
     window = np.sin(np.pi * (np.arange(size) + 0.5) / size).astype(np.float32) ** 2
-    spectrum = scipy.fft.fft(samples * window)
-    power = spectrum.real**2 + spectrum.imag**2
+    antennas = samples.shape[1]
+    threshold = gammainccinv(antennas, rate) / gammaincinv(antennas, 0.5)
+    # a strong crossing, cut to the threshold, covers no line
+    strength = (samples.real**2 + samples.imag**2).sum(axis=1, keepdims=True)
+    cut = threshold * np.median(strength, axis=(-2, -1), keepdims=True) / strength
+    limited = scipy.fft.fft(samples * window * np.sqrt(np.minimum(cut, 1)))
+    power = limited.real**2 + limited.imag**2
     # the power of noise in a bin is exponential, its median ln 2 of the mean
     most = np.median(power, axis=-1, keepdims=True) * (-np.log(rate) / np.log(2))
     lines = power > most
+    spectrum = scipy.fft.fft(samples * window)
     spectrum[lines] = 0
     rest = scipy.fft.ifft(spectrum)
     # what is left of white noise: less of it, and that of the lines spread over the chirp
@@ -42,8 +48,6 @@ def excised(cube: IFCube, rate: float) -> IFCube:
     noise = (1 - 2 * share) * window**2 + share * np.mean(window**2)
     inside = window > LEAST_WINDOW
     total = (rest.real**2 + rest.imag**2).sum(axis=1) / noise  # Gamma distributed
-    antennas = samples.shape[1]
-    threshold = gammainccinv(antennas, rate) / gammaincinv(antennas, 0.5)
     level = np.median(total[..., inside], axis=(-2, -1), keepdims=True)
     hit = (total > threshold * level) & inside
     return replace(cube, samples=np.where(hit[:, None], samples - rest / window, samples))
