@@ -118,7 +118,7 @@ def test_a_foreign_swarm_costs_what_the_page_says():
 
 @pytest.mark.slow
 def test_a_strong_radar_nearby_takes_the_data_unless_it_is_excised():
-    """`wing` 5 m before PT1 with 36 dBm of EIRP, in free space. Planted bug: `cut` of 1."""
+    """`wing` 5 m before PT1, 36 dBm of EIRP, in free space. Planted bug: samples as they were."""
     wing = "{position_m: [4.2, 8.7, 11.4], velocity_mps: [-0.3, -3.1, 0.2], boresight: [0, 1, 0], "
     wing += "power_dbm: 31, start_hz: 77.3e9, slope_mhz_per_us: 35, ramp_us: 18, idle_us: 4.5, "
     wing += "clock_drift_ppm: 5}"
