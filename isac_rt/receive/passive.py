@@ -11,6 +11,7 @@ from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.chain import Refiner, excised, passive_detector_of, reader_of, refiner_of
+from isac_rt.receive.directions import search_of
 from isac_rt.receive.estimate import Estimate
 from isac_rt.receive.joint.moments import Moments
 from isac_rt.receive.joint.neighbours import separate
@@ -50,6 +51,10 @@ known, the whole row is the prediction's."""
 MOST_WRONG = 1.0
 """Transitions of a frame that may be expected wrong where its samples are fitted all the same: a
 chain that turns in its middle looks like several paths."""
+
+SAME_PATH = 0.3, 0.15
+"""Detections are of one path within so many cells of range and velocity and so many resolutions of
+direction."""
 
 SAME_PHASE = 1e-3
 """Phases that are decided once more are those before, if they differ by no more: rounding."""
@@ -283,10 +288,10 @@ class PassiveReceiver:
         now and then be acquired."""
         d, rule = sensed.detections, self.detector.rule(known)
         sure = d.snr > replace(rule, rate=rule.rate / sensed.power.size).threshold
+        power = np.array([_power(e) for e in sensed.estimates])
+        sure &= power >= 10 ** (-REFERENCE_SPAN_DB / 10) * power.max(initial=0.0)
         if not sure.any():
             return d, None
-        power = np.array([_power(e) for e in sensed.estimates])
-        sure &= power >= 10 ** (-REFERENCE_SPAN_DB / 10) * power.max()
         first = np.flatnonzero(sure)[np.argmin(d.range[sure])]
         return replace(d, is_reference=np.arange(len(d)) == first), sensed.estimates[first]
 
@@ -402,10 +407,13 @@ def receive_passive(
 
 
 def _off(detections: Detections, paths: Detections, known: Known) -> np.ndarray:
-    """(Q,) which detections are more than a cell of range or of velocity off all of some paths."""
-    w, d = known.waveform, detections
-    is_far = np.abs(d.range[:, None] - paths.range) / w.range_cell(1) > 1
-    is_far |= np.abs(d.velocity[:, None] - paths.velocity) / w.velocity_cell(1) > 1
+    """(Q,) which detections are of none of some paths (`SAME_PATH`)."""
+    w, d, beam = known.waveform, detections, search_of(known.antennas, known.wavenumber, 1).beam
+    cell, resolution = SAME_PATH
+    is_far = np.abs(d.range[:, None] - paths.range) / w.range_cell(1) > cell
+    is_far |= np.abs(d.velocity[:, None] - paths.velocity) / w.velocity_cell(1) > cell
+    turned = np.abs(np.nan_to_num(d.direction)[:, None] - np.nan_to_num(paths.direction))
+    is_far |= (turned > resolution * beam).any(axis=2)
     return is_far.all(axis=1)
 
 

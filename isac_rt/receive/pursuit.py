@@ -282,14 +282,19 @@ def _fit_again(
         near = near[moved]
 
 
+def lobes_over(power: float) -> int:
+    """Return the rows on each side in which Hann's lobes, 1 / (pi d^3)^2 of a peak of such a power,
+    are above 1; a row for migration."""
+    lobe = (max(power, 1.0) / np.pi**2) ** (1 / 6)
+    return int(min(np.ceil(lobe) + 3, FARTHEST_REACH))
+
+
 def _subtract(spectra: np.ndarray, path: _Path, known: Known, noise: float) -> None:
     """Subtract a path in place from its rows, with the template of `LocalSpectra` and each
     element's own delay."""
     w, e = known.waveform, path.estimate
     middle = round(float(w.beat_cells(e.delay, e.delay_rate).mean()))
-    # of Hann's lobes, 1 / (pi d^3)^2; a row for migration
-    lobe = (max(path.power / (LEAST * noise), 1.0) / np.pi**2) ** (1 / 6)
-    reach = int(min(np.ceil(lobe) + 3, FARTHEST_REACH))
+    reach = lobes_over(path.power / (LEAST * noise))
     path.rows = max(middle - reach, 0), min(middle + reach + 1, spectra.shape[2])
     direction = np.nan_to_num(direction_cosines(e, known))
     path.received, path.sent = (

@@ -1,5 +1,5 @@
 r"""A passive terminal's search for weak echoes: strong paths out, then every direction of every
-cell, whitened where clutter is.
+cell, whitened where clutter is, and once more in what the waves found there leave.
 
 What each transmit antenna sends comes from a direction that the receiver does not know, so that
 the channels of a cell are matched receiver by receiver and added in power over the L_tx transmit
@@ -18,7 +18,8 @@ The search is separable as at the active terminal (`isac_rt.receive.directions`)
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from isac_rt.extensions.city_receivers.adaptive import (
 )
 from isac_rt.extensions.city_receivers.angle_doppler import noise_level
 from isac_rt.extensions.city_receivers.covariance import Bucketed
+from isac_rt.extensions.city_receivers.echoes import Wave, Waves
 from isac_rt.extensions.city_receivers.power import TAPER, expected_power
 from isac_rt.receive.cfar import (
     first_row,
@@ -45,153 +47,183 @@ from isac_rt.receive.directions import (
 from isac_rt.receive.estimate import (
     Estimate,
     LocalSpectra,
+    direction_cosines,
     near_beam,
     standard_deviations,
 )
 from isac_rt.receive.known import Known
-from isac_rt.receive.maps import UNION_FLOOR
-from isac_rt.receive.pursuit import RESIDUAL_DB, BySchedule, extract_strong
-from isac_rt.receive.sense import Sensed, describe
+from isac_rt.receive.maps import UNION_FLOOR, maps_with_power
+from isac_rt.receive.pursuit import BySchedule, extract_strong
+from isac_rt.receive.sense import Sensed, describe, window_gain
+from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import NO_HINTS, Detections, ExpectedClutter, Hints
 
-BESIDE = (3, 1)
-"""Rows and bins about a path that was taken out which may hold its remainder, `RESIDUAL_DB` below
-it."""
+ROUNDS = 4
+"""Most searches, each of what the waves found before leave."""
+FARTHEST = 1.5
+"""Cells or bins that a wave may move away from where it was found."""
 STD_CELLS = 0.1
 """Smallest deviation of range and velocity, in cells, of what shares its cell with others."""
 
 
 @dataclass(frozen=True)
 class BeamSearch(BySchedule):
-    """The CFAR for paths that stand out, beams for those that do not."""
+    """The CFAR for paths that stand out, beams for those that do not, all of them waves."""
 
     def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
         if not known.full:
             return super().sense(spectra, known, hints)
-        clutter = hints.clutter
-        strong, snr, power, left, maps, rest = extract_strong(spectra, known, self.settings)
-        _, level = self.rule(known).detect(power)
-        left_over = Remainder.of(strong, snr, known, rest.shape)
-        noise, expected = self._noise(rest, known, clutter)
-        ratio, sure, cosines = self._test(maps, noise, expected, known, clutter, left_over)
-        found = rest / (noise + expected)
-        held_up = unexplained(found, ratio > 1, self.settings, left_over.power > 0)
-        ratio, sure = ratio / held_up, sure / held_up
-        ratio[: first_row(self.settings, known.range_cell)] = 0
-        rows, bins = strongest_peaks(ratio, ratio > 1, self.settings, UNION_FLOOR)
-        weak, estimates = [], []
-        for row, column in zip(rows.tolist(), bins.tolist(), strict=True):
-            beam = _Beam(left, known, row, cosines[row, column])
-            e = self.estimator.at(beam, ratio, row, column)
-            estimates.append(e)
-            weak.append(near_beam(e, known, cosines[row, column]))
-        limit = self._limits(receiver_search(known.antennas, known.wavenumber), known)[0]
-        detections = _described(
-            estimates, np.array(weak).reshape(-1, 2), ratio[rows, bins] * limit, known
+        strong = extract_strong(spectra, known, self.settings)
+        _, level = self.rule(known).detect(strong.whole)
+        test = _Test.of(self.settings, known, strong.power, hints.clutter)
+        found = Waves(spectra.copy(), known, test.noise / window_gain(known), test.search.beam)
+        each = zip(strong.paths, strong.snr.tolist(), strict=True)
+        found.take_out([self._strong(found, *path, test) for path in each])
+        found.changed_rows()
+        weak = self._weak(found, test)
+        estimates = [*strong.paths, *(found.estimate(f.wave) for f in weak)]
+        joined = [describe(strong.paths, strong.snr, known), self._described(weak, test)]
+        return Sensed(estimates, Detections.joined(joined), strong.whole, level)
+
+    def _strong(self, found: Waves, estimate: Estimate, power: float, test: _Test) -> Wave:
+        """Return the wave of a path that stands out by such a power over the noise."""
+        cosines = np.array(direction_cosines(estimate, test.known))
+        cosines[test.search.beam == 0] = 0.0
+        if np.isnan(cosines).any():  # several waves, which look like one from nowhere
+            channels = estimate.channels.astype(np.complex64)[:, :, None]
+            cosines = search_plain(channels, test.search, 1.0, 0.0).cosines[0]
+        return found.wave(estimate, cosines, power, strong=True)
+
+    def _weak(self, found: Waves, test: _Test) -> list[_Found]:
+        """Return the waves that are found in what those before leave, and take them out."""
+        left, known, strong = found.left, test.known, len(found.waves)
+        most = self.settings.max_detections - strong
+        ratio, cosines = np.zeros(left.shape[2:], np.float32), np.full((*left.shape[2:], 2), np.nan)
+        refused, rows = np.zeros(ratio.shape, bool), np.arange(len(ratio))
+        power, weak = np.zeros(ratio.shape, np.float32), list[_Found]()
+        for _ in range(ROUNDS):
+            maps, power[rows] = maps_with_power(left[:, :, rows], known)
+            ratio[rows], cosines[rows] = test.ratio(maps, rows)
+            over = ratio / unexplained(
+                power / (test.noise + test.expected), ratio > 1, self.settings
+            )
+            over[refused] = 0
+            over[: first_row(self.settings, known.range_cell)] = 0
+            peaks = np.transpose(strongest_peaks(over, over > 1, self.settings, UNION_FLOOR))
+            new = []
+            for row, column in peaks[: most - len(weak)].tolist():
+                beam = _Beam(left, known, row, cosines[row, column])
+                e = self.estimator.at(beam, over, row, column)
+                towards = near_beam(e, known, cosines[row, column])
+                towards = np.where(np.isfinite(towards), towards, cosines[row, column])
+                wave = found.wave(e, towards, power[row, column] / test.noise, strong=False)
+                refused[row, column] = found.holds(wave)
+                if not refused[row, column]:
+                    new.append(_Found(wave, over[row, column], (row, column), found.place(wave)))
+            if not new:
+                break
+            found.take_out([f.wave for f in new])
+            for f in reversed(new):
+                astray = found.apart(found.place(f.wave), f.place).max() > FARTHEST
+                if astray or found.holds(f.wave):
+                    found.put_back(f.wave)
+                    refused[f.cell] = True
+            weak += [f for f in new if not refused[f.cell]]
+            rows = found.changed_rows()
+        return weak
+
+    def _described(self, weak: list[_Found], test: _Test) -> Detections:
+        """Return waves as detections, with deviations by what their beams hold."""
+        known, w = test.known, test.known.waveform
+        statistic = np.array([f.ratio for f in weak]) * test.limits[0]
+        snr = np.maximum(statistic - known.antennas.num_tx, 1.0) / known.channels
+        std = standard_deviations(snr, 0.0, known)
+        std *= np.array([f.wave.spread for f in weak]).reshape(-1, 4)
+        floor = STD_CELLS * np.array([w.range_cell(1), w.velocity_cell(1), 0.0, 0.0])
+        u = np.array([f.wave.cosines for f in weak]).reshape(-1, 2)
+        seen = known.antennas.observes(1) & (np.abs(u) <= known.antennas.view_limit)
+        return Detections(
+            range=np.array([f.wave.delay for f in weak]) * known.metres,
+            velocity=np.array([f.wave.rate for f in weak]) * known.metres,
+            direction=np.where(seen, u, np.nan),
+            snr=1 + snr,
+            std=np.hypot(std, floor),
+            is_reference=np.zeros(len(weak), bool),
+            starts=statistic > test.limits[1],
         )
-        detections = replace(detections, starts=sure[rows, bins] > 1)
-        joined = Detections.joined([describe(strong, snr, known), detections])
-        return Sensed([*strong, *estimates], joined, power, level)
 
-    def _noise(
-        self, power: np.ndarray, known: Known, clutter: ExpectedClutter | None
-    ) -> tuple[float, np.ndarray]:
-        """Return the noise of a cell of one channel, and the clutter's (rows, P)."""
-        if clutter is None:
-            return noise_level(power, None, known.channels), np.zeros_like(power)
-        expected = expected_power(clutter, known, len(power), TAPER)
-        return noise_level(power, expected, known.channels), expected
 
-    def _test(
-        self,
-        maps: np.ndarray,
-        noise: float,
-        expected: np.ndarray,
-        known: Known,
-        clutter: ExpectedClutter | None,
-        left_over: Remainder,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """T over its two thresholds, (rows, P), and its directions (rows, P, 2), Doppler
-        centred."""
-        search = receiver_search(known.antennas, known.wavenumber)
-        limit, least = self._limits(search, known), PRUNED * self._limits(search, known)[0]
-        shape = maps.shape[2:]
-        ratio, sure = np.zeros((2, maps[0, 0].size), np.float32)
-        cosines = np.full((ratio.size, 2), np.nan)
-        x = maps.reshape(*maps.shape[:2], -1)
-        plain = search_plain(x, search, noise, least)
-        ratio[plain.cell], sure[plain.cell] = plain.peak / limit[0], plain.peak / limit[1]
-        cosines[plain.cell] = plain.cosines
-        held = np.fft.ifftshift(expected / noise + left_over.power, axes=1).ravel()
-        cell = plain.cell[(held[plain.cell] > LEAST_CLUTTER) & (plain.peak > least)]
-        if cell.size:
-            rows, bins = np.divmod(cell, shape[1])
-            R = left_over.covariances(rows, bins, search)
-            if clutter is not None:
-                R += Bucketed.of(clutter, known, search, noise, TAPER).covariances(rows, bins)
-            else:
-                R += np.eye(R.shape[1], dtype=np.float32)
-            y = x[:, :, cell].transpose(2, 0, 1) / np.float32(np.sqrt(noise))
-            white, common = search_white(y, R, cell, search, least)
-            ratio[cell] = white.peak / (limit[0] * common)
-            sure[cell] = white.peak / (limit[1] * common)
-            cosines[cell] = white.cosines
-        ratio, sure, cosines = (
-            np.fft.fftshift(a.reshape(*shape, *a.shape[1:]), axes=1) for a in (ratio, sure, cosines)
-        )
-        return ratio, sure, cosines
+class _Found(NamedTuple):
+    """A wave, T over its threshold, the cell of the peak and the `Waves.place` of its first
+    estimate."""
 
-    def _limits(self, search: Search, known: Known) -> tuple[float, float]:
-        """Thresholds of a detection and of one that may start a track."""
-        size = scanned(search)
-        usual, sure = self.settings.false_alarm_rates
-        looks = known.antennas.num_tx
-        return field_threshold(*size, looks, usual), field_threshold(*size, looks, sure)
+    wave: Wave
+    ratio: float
+    cell: tuple[int, int]
+    place: np.ndarray
 
 
 @dataclass(frozen=True)
-class Remainder:
-    """Residue of the removal of strong paths, from their directions.
+class _Test:
+    """T of cells over its threshold.
 
     Attributes
     ----------
-    power : (rows, P) over the noise of a cell of one channel, Doppler centred
-    owner : (rows, P) number of the strong path that leaves most there
-    channels : (S, L_tx, L_rx) the strong paths' own
+    noise : of a cell of one channel
+    expected : (rows, P) power of the clutter, Doppler centred
+    limits : of T, of a detection and of one that may start a track
+    scatterers : the clutter by cell, None: nothing is known of it
     """
 
-    power: np.ndarray
-    owner: np.ndarray
-    channels: np.ndarray
+    known: Known
+    search: Search
+    noise: float
+    expected: np.ndarray
+    limits: tuple[float, float]
+    scatterers: Bucketed | None
 
     @classmethod
     def of(
-        cls, strong: list[Estimate], snr: np.ndarray, known: Known, shape: tuple[int, ...]
-    ) -> Remainder:
-        """`RESIDUAL_DB` below each strong path, in the cells `BESIDE` it."""
-        w, power, owner = known.waveform, np.zeros(shape, np.float32), np.zeros(shape, np.int64)
-        for k, (e, over) in enumerate(zip(strong, snr, strict=True)):
-            row = round(float(w.beat_cells(e.delay, e.delay_rate, 0.0)))
-            column = round(e.delay_rate * w.frame_duration * w.effective_carrier) + shape[1] // 2
-            rows = np.arange(max(row - BESIDE[0], 0), min(row + BESIDE[0] + 1, shape[0]))
-            block = np.ix_(rows, (np.arange(-BESIDE[1], BESIDE[1] + 1) + column) % shape[1])
-            more = over * 10 ** (-RESIDUAL_DB / 10) > power[block]
-            power[block] = np.where(more, over * 10 ** (-RESIDUAL_DB / 10), power[block])
-            owner[block] = np.where(more, k, owner[block])
-        size = known.antennas.num_tx, known.antennas.num_rx
-        return cls(power, owner, np.array([e.channels for e in strong]).reshape(-1, *size))
-
-    def covariances(self, rows: np.ndarray, bins: np.ndarray, search: Search) -> np.ndarray:
-        """(S, L, L) complex64 in cells, Doppler in FFT order, in units of the noise."""
-        c = self.channels
-        if not len(c):
-            return np.zeros((rows.size, c.shape[2], c.shape[2]), np.complex64)
-        power, owner = (np.fft.ifftshift(x, axes=1)[rows, bins] for x in (self.power, self.owner))
-        each = np.einsum("sti,stj->sij", c, c.conj())
-        each *= (
-            search.spread(TAPER.cosine) / (np.abs(c) ** 2).mean(axis=2).sum(axis=1)[:, None, None]
+        cls, settings: Receivers, known: Known, power: np.ndarray, clutter: ExpectedClutter | None
+    ) -> _Test:
+        search, looks = receiver_search(known.antennas, known.wavenumber), known.antennas.num_tx
+        usual, sure = (
+            field_threshold(*scanned(search), looks, rate) for rate in settings.false_alarm_rates
         )
-        return power[:, None, None] * each.astype(np.complex64)[owner]
+        expected = np.zeros_like(power)
+        if clutter is None:
+            noise = noise_level(power, None, known.channels)
+            return cls(known, search, noise, expected, (usual, sure), None)
+        expected = expected_power(clutter, known, len(power), TAPER)
+        noise = noise_level(power, expected, known.channels)
+        scatterers = Bucketed.of(clutter, known, search, noise, TAPER)
+        return cls(known, search, noise, expected, (usual, sure), scatterers)
+
+    def ratio(self, maps: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """T over the first threshold in rows (S,), (S, P), and its directions (S, P, 2), Doppler
+        centred, of `channel_maps` (L_tx, L_rx, S, P)."""
+        search, limit, shape = self.search, self.limits[0], maps.shape[2:]
+        least = PRUNED * limit
+        ratio = np.zeros(maps[0, 0].size, np.float32)
+        cosines = np.full((ratio.size, 2), np.nan)
+        x = maps.reshape(*maps.shape[:2], -1)
+        plain = search_plain(x, search, self.noise, least)
+        ratio[plain.cell], cosines[plain.cell] = plain.peak / limit, plain.cosines
+        if self.scatterers is not None:
+            held = (
+                np.fft.ifftshift(self.expected[rows], axes=1).ravel() > LEAST_CLUTTER * self.noise
+            )
+            cell = plain.cell[held[plain.cell] & (plain.peak > least)]
+            if cell.size:
+                at, bins = np.divmod(cell, shape[1])
+                R = self.scatterers.covariances(rows[at], bins)
+                y = x[:, :, cell].transpose(2, 0, 1) / np.float32(np.sqrt(self.noise))
+                white, common = search_white(y, R, cell, search, least)
+                ratio[cell], cosines[cell] = white.peak / (limit * common), white.cosines
+        ratio, cosines = (
+            np.fft.fftshift(a.reshape(*shape, *a.shape[1:]), axes=1) for a in (ratio, cosines)
+        )
+        return ratio, cosines
 
 
 class _Beam(LocalSpectra):
@@ -201,23 +233,3 @@ class _Beam(LocalSpectra):
         towards = receiver_search(known.antennas, known.wavenumber).steering(cosines).conj()
         beam = np.tile(towards.astype(complex), (known.antennas.num_tx, 1))
         super().__init__(spectra, known, row, beam=beam)
-
-
-def _described(
-    found: list[Estimate], direction: np.ndarray, statistic: np.ndarray, known: Known
-) -> Detections:
-    """Detections with deviations by what the beam holds."""
-    w, looks = known.waveform, known.antennas.num_tx
-    snr = np.maximum(statistic - looks, 1.0) / known.channels
-    std = standard_deviations(snr, 0.0, known)
-    floor = STD_CELLS * np.array([w.range_cell(1), w.velocity_cell(1), 0.0, 0.0])
-    limit = known.antennas.view_limit
-    return Detections(
-        range=np.array([e.delay for e in found]) * known.metres,
-        velocity=np.array([e.delay_rate for e in found]) * known.metres,
-        direction=np.where((np.abs(direction) <= limit), direction, np.nan),
-        snr=1 + snr,
-        std=np.hypot(std, floor),
-        is_reference=np.zeros(len(found), bool),
-        starts=np.ones(len(found), bool),
-    )
