@@ -103,13 +103,13 @@ def test_the_delays_of_transmit_antennas_are_fitted():
 
 
 def test_deviations_of_waves_that_share_a_cell():
-    """Errors over 60 draws of noise of two waves, over those of one alone, are as `spread` says
+    """Errors over 40 draws of noise of two waves, over those of one alone, are as `spread` says
     within chance, a fifth. Planted bug: no more than that of the wave alone."""
     second = Path(SIGHT.length + 0.5 * CELL, SIGHT.rate, 1.0, (0.06, -0.02), (-0.3, 0.2))
     errors: dict[int, list[np.ndarray]] = {1: [], 2: []}
     clean = {n: spectra_of([SIGHT, second][:n]) for n in errors}
     rng, spread = np.random.default_rng(3), np.ones(4)
-    for _ in range(60):
+    for _ in range(40):
         noise = rng.standard_normal((*clean[1][0].shape, 2)).astype(np.float32) @ [1, 1j]
         for n, (spectra, known) in clean.items():
             found = waves_of(
