@@ -101,12 +101,13 @@ class BeamSearch(BySchedule):
         ratio, cosines = np.zeros(left.shape[2:], np.float32), np.full((*left.shape[2:], 2), np.nan)
         refused, rows = np.zeros(ratio.shape, bool), np.arange(len(ratio))
         power, weak = np.zeros(ratio.shape, np.float32), list[_Found]()
+        raised: float | np.ndarray = 1.0  # what is taken out goes on raising the threshold
         for _ in range(ROUNDS):
             maps, power[rows] = maps_with_power(left[:, :, rows], known)
             ratio[rows], cosines[rows] = test.ratio(maps, rows)
-            over = ratio / unexplained(
-                power / (test.noise + test.expected), ratio > 1, self.settings
-            )
+            around = power / (test.noise + test.expected)
+            raised = np.maximum(raised, unexplained(around, ratio > 1, self.settings))
+            over = ratio / raised
             over[refused] = 0
             over[: first_row(self.settings, known.range_cell)] = 0
             peaks = np.transpose(strongest_peaks(over, over > 1, self.settings, UNION_FLOOR))

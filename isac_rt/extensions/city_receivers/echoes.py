@@ -53,10 +53,10 @@ class Wave:
     delay, rate : at mid-frame [s, 1]
     cosines : (2,) u_x, u_z of arrival
     sent : (L_tx,) complex amplitudes of a sample
-    late : (L_tx,) delays of the transmit antennas [cells], fitted if `strong`
+    late : (L_tx,) delays of the transmit antennas [cells], fitted of a strong one
     reach : range rows on each side in which it is taken out
-    received : (L_rx,) complex, of a strong one in place of the steering: the receivers as it shows
-        them, which may differ
+    received : (L_rx,) complex, the receivers as a strong one shows them, which may differ from the
+        steering; None: of a weak one
     spread : (4,) deviations of delay, rate and cosines over those of the wave alone
     """
 
@@ -65,7 +65,6 @@ class Wave:
     cosines: np.ndarray
     sent: np.ndarray
     late: np.ndarray
-    strong: bool
     reach: int
     received: np.ndarray | None = None
     spread: np.ndarray = field(default_factory=lambda: np.ones(4))
@@ -116,7 +115,7 @@ class Waves:
             a = self._steering(e.delay, cosines)[0][0]
             sent = e.channels @ a.conj() / a.size
         late = np.zeros(sent.size)
-        return Wave(e.delay, e.delay_rate, np.array(cosines), sent, late, strong, reach, received)
+        return Wave(e.delay, e.delay_rate, np.array(cosines), sent, late, reach, received)
 
     def estimate(self, wave: Wave) -> Estimate:
         """Return a wave as an estimate."""
@@ -160,7 +159,7 @@ class Waves:
             number = np.where(near, number, number.size).min(axis=1)
         for group in np.unique(number[len(self.waves) - len(waves) :]):
             mine = [self.waves[k] for k in np.flatnonzero(number == group)]
-            if len(mine) > 1 or mine[0].strong:
+            if len(mine) > 1 or mine[0].received is not None:
                 self._fit(mine)
 
     def put_back(self, wave: Wave) -> None:
@@ -237,7 +236,7 @@ class Waves:
     def _tangents(self, wave: Wave, rows: np.ndarray) -> _Tangents:
         """Return the derivatives by both parts of each amplitude, by the delays [cells] of all
         antennas or of each, the rate [bins] and the cosines [resolutions]."""
-        w, times = self._known.waveform, self._known.times
+        known, w, times = self._known, self._known.waveform, self._known.times
         beat = w.beat_cells(wave.delay, wave.rate, times)
         faster = w.beat_cells(wave.delay, wave.rate + rate_bin(w), times) - beat
         offset = (beat + wave.late[self._schedule])[:, None] - rows[:, None]
@@ -245,20 +244,15 @@ class Waves:
         phasor = np.exp(2j * np.pi * self._cycles(wave))[:, None] * back * self._weight
         unit = phasor * hann_response(w, offset)
         ahead, behind = (hann_response(w, offset + step) for step in (STEP, -STEP))
-        sent, by_antenna = (
-            wave.sent[self._schedule][:, None],
-            [m[:, None] for m in self._known.sent_by],
-        )
-        later, turn = (
-            sent * phasor * (ahead - behind) / (2 * STEP),
-            rate_bin(w) * w.effective_carrier,
-        )
+        sent, by_antenna = wave.sent[self._schedule][:, None], [m[:, None] for m in known.sent_by]
+        later = sent * phasor * (ahead - behind) / (2 * STEP)
+        turn = 2j * np.pi * rate_bin(w) * w.effective_carrier * times[:, None]
+        weak = wave.received is None
         parts = [unit * mine * factor for mine in by_antenna for factor in (1, 1j)]
-        parts += [later * mine for mine in by_antenna] if wave.strong else [later]
-        parts += [2j * np.pi * turn * times[:, None] * sent * unit + faster[:, None] * later]
-        axes = self._axes if wave.received is None else self._axes[:0]
-        receiver = np.append(np.zeros(len(parts), int), 1 + axes)
-        parts += [sent * unit] * axes.size
+        parts += [later] if weak else [later * mine for mine in by_antenna]
+        parts += [turn * sent * unit + faster[:, None] * later]
+        receiver = np.append(np.zeros(len(parts), int), 1 + self._axes[: None if weak else 0])
+        parts += [sent * unit] * (receiver.size - len(parts))
         by_chirp = np.array(parts).reshape(len(parts), -1)
         return _Tangents(by_chirp, receiver, self._responses(wave)[0])
 
@@ -299,13 +293,13 @@ class Waves:
         w, size, before = self._known.waveform, wave.sent.size, self._cycles(wave)
         sent = wave.sent + move[: 2 * size : 2] + 1j * move[1 : 2 * size : 2]
         rest = np.clip(move[2 * size :], -LARGEST, LARGEST)
-        late, rest = np.split(rest, [size if wave.strong else 1])
+        late, rest = np.split(rest, [1 if wave.received is None else size])
         late = wave.late + late
         wave.late = late - late.mean()
         wave.delay += float(late.mean()) * w.delay_step
         wave.rate += float(rest[0]) * rate_bin(w)
-        u = wave.cosines.copy()
         if wave.received is None:
+            u = wave.cosines.copy()
             u[self._axes] += rest[1:] * self._beam[self._axes]
             wave.cosines = u / max(float(np.linalg.norm(u)), 1.0)
         turned = np.exp(2j * np.pi * (self._cycles(wave) - before))
