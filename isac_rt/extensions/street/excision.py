@@ -34,7 +34,8 @@ def excised(cube: IFCube, rate: float) -> IFCube:
     threshold = gammainccinv(antennas, rate) / gammaincinv(antennas, 0.5)
     # a strong crossing, cut to the threshold, covers no line
     strength = (samples.real**2 + samples.imag**2).sum(axis=1, keepdims=True)
-    cut = threshold * np.median(strength, axis=(-2, -1), keepdims=True) / strength
+    most = threshold * np.median(strength, axis=(-2, -1), keepdims=True)
+    cut = most / np.maximum(strength, np.finfo(np.float32).tiny)
     limited = scipy.fft.fft(samples * window * np.sqrt(np.minimum(cut, 1)))
     power = limited.real**2 + limited.imag**2
     # the power of noise in a bin is exponential, its median ln 2 of the mean

@@ -38,6 +38,11 @@ def noise() -> np.ndarray:
     return rng.standard_normal((2, 5, 60, 512, 2)) @ np.array([1, 1j]) / np.sqrt(2)
 
 
+def test_samples_of_nothing_stay_nothing():
+    """Planted bug: nothing divided by nothing."""
+    assert not excised(cube_of(np.zeros((2, 5, 60, 512))), 1e-4).samples.any()
+
+
 def pulse() -> np.ndarray:
     """A chirp through the band in 40 samples, in every second chirp."""
     u = np.arange(512) - 200.3
