@@ -241,7 +241,7 @@ MAX_LINES = {
     "world": 3886,
     "propagation": 4789,
     "signal": 837,
-    "receive": 6096,
+    "receive": 6090,
     "track": 1975,
     "scenario": 2213,
     "results": 3745,

@@ -31,7 +31,6 @@ from isac_rt.receive.maps import (
     LATIN_UNION,
     UNION_FLOOR,
     LatinUnion,
-    maps_with_power,
     power_map,
 )
 from isac_rt.receive.omp import Omp, sparse_enough
@@ -137,31 +136,26 @@ def pursue(
 
 
 class StrongPaths(NamedTuple):
-    """Strong paths of a frame and the residual.
+    """Strong paths of a frame, and the power without them.
 
     Attributes
     ----------
     paths : list of Estimate
     snr : of each, on the map in which it was found
     whole : (rows, P) power before subtraction
-    left : residual spectra
-    maps : `channel_maps` of the residual
-    power : `accumulate` of these
+    power : (rows, P) of what is left
     """
 
     paths: list[Estimate]
     snr: np.ndarray
     whole: np.ndarray
-    left: np.ndarray
-    maps: np.ndarray
     power: np.ndarray
 
 
 def extract_strong(spectra: np.ndarray, known: Known, settings: Receivers) -> StrongPaths:
     """Subtract the paths at least `STRONG_DB` over the noise; parameters as for `pursue`."""
     left, floor = spectra.copy(), sidelobe_floor(known)
-    maps, power = maps_with_power(left, known)
-    whole = known.mapped(spectra, lambda: power)
+    whole = known.mapped(spectra, lambda: power_map(spectra, known))
     power = whole.copy()
     noise = max(float(np.median(power)), 1e-30)
     masked, level = np.zeros(power.shape), np.full(power.shape, noise)
@@ -174,9 +168,9 @@ def extract_strong(spectra: np.ndarray, known: Known, settings: Receivers) -> St
         if not rows.size:
             break
         changed = _find(left, power, level, (rows, bins), extracted, masked, known, noise)
-        maps[:, :, changed], power[changed] = maps_with_power(left[:, :, changed], known)
+        _map_again(power, left, changed, known)
     paths, snr = [f.estimate for f in extracted], np.array([f.snr for f in extracted])
-    return StrongPaths(paths, snr, whole, left, maps, power)
+    return StrongPaths(paths, snr, whole, power)
 
 
 def _find(

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.estimate import HALF_WIDTH, Estimate, hann_response
@@ -77,7 +78,8 @@ class _Tangents(NamedTuple):
     ----------
     by_chirp : (N, M rows P) complex, of each parameter
     receiver : (N,) which of the functions of the receiver goes with each
-    by_receiver : (3, L_rx) the steering and its derivatives by both cosines
+    by_receiver : (3, L_rx) the steering and its derivatives by both cosines, or (1, L_rx) what a
+        strong wave shows
     """
 
     by_chirp: np.ndarray
@@ -154,9 +156,7 @@ class Waves:
             self._add(wave, -1.0)
         places = np.array([self.place(wave) for wave in self.waves]).reshape(-1, 2)
         near = (self.apart(places[:, None], places) < LOBES).all(axis=2)
-        number = np.arange(len(places))
-        for _ in number:
-            number = np.where(near, number, number.size).min(axis=1)
+        number = connected_components(near, directed=False)[1]
         for group in np.unique(number[len(self.waves) - len(waves) :]):
             mine = [self.waves[k] for k in np.flatnonzero(number == group)]
             if len(mine) > 1 or mine[0].received is not None:
