@@ -158,6 +158,8 @@ EXTENSIONS = {
     "excised": "isac_rt.extensions.street.excision:excised",
     "boxes": "isac_rt.extensions.street.boxes:Boxes",
     "box_corners": "isac_rt.extensions.street.boxes:box_corners",
+    "corners_of_mesh": "isac_rt.extensions.street.solid:corners_of_mesh",
+    "solid_of_box": "isac_rt.extensions.street.solid:solid_of_box",
     "weather": "isac_rt.extensions.street.weather:Weathered",
     "weather_plan": "isac_rt.extensions.street.weather:plan_rows",
     "antenna_pattern": "isac_rt.extensions.antenna_files.patterns:antenna_pattern",

@@ -333,6 +333,11 @@ def _pattern(path: Path) -> dict[str, Any]:
     return pattern
 
 
+def _solid(path: Path) -> dict[str, Any]:
+    corners: dict[str, Any] = extension("corners_of_mesh")(path)
+    return corners
+
+
 def _tables_of(tree: dict[str, Any], folder: Path) -> Iterator[tuple[Key, str, Reader]]:
     """Mappings of a tree that may name a table, the key that does, and how it is read."""
     swarm = tree.get("swarm")
@@ -347,6 +352,7 @@ def _tables_of(tree: dict[str, Any], folder: Path) -> Iterator[tuple[Key, str, R
         yield ("swarm", name), "flight", partial(_flight, tree.get("city"), folder, directed)
         yield ("swarm", name, "rcs"), "file", by_aspect("dbsm")
         yield ("swarm", name, "extent"), "file", _centres
+        yield ("swarm", name, "box"), "file", _solid
 
 
 def with_tables(

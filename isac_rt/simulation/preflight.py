@@ -137,13 +137,13 @@ def _check_box(
     name, inner = names
     if (box := swarm.uavs[name].box) is None:
         return
-    half = np.array(box.size_m) / 2
-    for i in np.flatnonzero(np.linalg.norm(offset, axis=1) < np.linalg.norm(half)):
+    solid = extension("solid_of_box")(name, box)
+    for i in np.flatnonzero(np.linalg.norm(offset, axis=1) < solid.reach):
         pose = swarm.trajectories[name].pose(epochs[i])
-        if (np.abs(pose.to_body(offset[i])) <= half).all():
+        if (solid.depths(pose.to_body(offset[i])) >= 0).all():
             raise ScenarioError(
                 f"swarm.{inner}: is inside the box of {name} at {epochs[i]:.4g} s; change one of "
-                "their flights, or the box's size_m"
+                "their flights, or the box"
             )
 
 

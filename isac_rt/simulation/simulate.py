@@ -119,7 +119,9 @@ def _with_boxes(dataset: xr.Dataset, swarm: Swarm) -> xr.Dataset:
         return dataset
     corners = extension("box_corners")(swarm, dataset.time.values)
     about = {"units": "m", "long_name": "corners of the UAV's box in world axes"}
-    values = np.stack([*corners.values()], axis=1)
+    most = max(of_one.shape[1] for of_one in corners.values())
+    fill = [((0, 0), (0, most - c.shape[1]), (0, 0)) for c in corners.values()]
+    values = np.stack([*map(partial(np.pad, mode="edge"), corners.values(), fill)], axis=1)
     named = dataset.assign_coords(box=("box", np.array([*corners], object)))
     return named.assign(box_corner=(("frame", "box", "corner", "axis"), values, about))
 

@@ -18,12 +18,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 
+from isac_rt.extensions.street.solid import FLAT, solid_of
 from isac_rt.frame.link import Link
 from isac_rt.kernels import views_raster
 from isac_rt.kernels.jit import twin_of
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.results.files import write_figure
-from isac_rt.views.scene import BOX_FACES, boxes_of, strongest
+from isac_rt.views.figures import outline
+from isac_rt.views.scene import boxes_of, strongest
 from isac_rt.views.style import KIND_COLOURS, ROLE_MARKERS, colour_of, words
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.passage import hits
@@ -248,14 +250,13 @@ class _Picture:
         ]
 
     def boxes(self, corners: Mapping[int, np.ndarray]) -> None:
-        """The sides of boxes (8, 3), by the UAV's index, that look here, the farthest first."""
+        """The sides of boxes (V, 3), by the UAV's index, that look here, the farthest first."""
         for u, box in sorted(corners.items(), key=lambda one: -self.view.project(one[1])[0, 2]):
-            seen = self.view.project(box)
-            occluded = is_masked(box.mean(axis=0), self.view, self.depth)
-            order = sorted(BOX_FACES, key=lambda face: -seen[list(face), 2].mean())
-            for face in order[3:]:
-                side = Polygon(seen[list(face), :2], fc=colour_of(u), ec="white", lw=0.7, zorder=7)
-                side.set_alpha(_OCCLUDED_ALPHA if occluded else 0.9)
+            alpha = _OCCLUDED_ALPHA if is_masked(box.mean(axis=0), self.view, self.depth) else 0.9
+            colour, solid = colour_of(u), solid_of(box)
+            for k in np.flatnonzero(solid.planes[:, :3] @ self.view.axes[2] < 0):
+                rim = self.view.project(box[np.abs(solid.depths(box)[:, k]) <= FLAT])
+                side = Polygon(outline(rim), fc=colour, ec="white", lw=0.7, alpha=alpha, zorder=7)
                 self.ax.add_patch(side)
 
     def swarm(self, swarm: Swarm, times: np.ndarray, time: float, below: Below) -> list[Line2D]:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
+from scipy.spatial import ConvexHull
 
 from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind, PathSet
@@ -45,8 +46,6 @@ ROLE_SYMBOLS = {
     "object": "diamond-open",
 }
 _AXES = "xyz"
-BOX_FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
-"""Corners round each face of a box, its corners in the order of their signs along its axes."""
 _SHOWN = frozenset(
     "uav role uav_position observer track_observer track_frame track_confirmed owner fused_frame "
     "fused_owner fused_terminal fused_x fused_y fused_z box box_corner".split()
@@ -145,7 +144,7 @@ def _uavs(names: Sequence[str], roles: Sequence[str], positions: np.ndarray) -> 
 
 
 def boxes_in(dataset: xr.Dataset) -> dict[int, np.ndarray]:
-    """Return the corners of the boxes of a run (F, 8, 3) [m], by the UAV's index."""
+    """Return the corners of the boxes of a run (F, V, 3) [m], by the UAV's index."""
     if "box" not in dataset.variables:
         return {}
     names, corners = dataset.uav.values.tolist(), dataset.box_corner.values
@@ -153,24 +152,23 @@ def boxes_in(dataset: xr.Dataset) -> dict[int, np.ndarray]:
 
 
 def boxes_of(swarm: Swarm, time: float) -> dict[int, np.ndarray]:
-    """Return the corners of a swarm's boxes (8, 3) [m] at a time [s], by the UAV's index."""
-    if not swarm.has_boxes:
-        return {}
+    """Return the corners of a swarm's boxes (V, 3) [m] at a time [s], by the UAV's index."""
     names, corners = list(swarm.uavs), extension("box_corners")(swarm, [time])
     return {names.index(name): of_one[0] for name, of_one in corners.items()}
 
 
 def _boxes(corners: Mapping[int, np.ndarray]) -> Trace:
-    """Boxes (8, 3) [m] by the UAV's index."""
-    faces = np.array([t for a, b, c, d in BOX_FACES for t in ((a, b, c), (a, c, d))])
-    every = np.concatenate([faces + 8 * k for k in range(len(corners))])
+    """Boxes (V, 3) [m] by the UAV's index."""
+    faces = [ConvexHull(box).simplices for box in corners.values()]
+    first = np.cumsum([0, *map(len, corners.values())])
+    every = np.concatenate([f + start for f, start in zip(faces, first, strict=False)])
     return {
         "type": "mesh3d",
         "name": "boxes",
         "hoverinfo": "skip",
         "flatshading": True,
         "showlegend": True,
-        "facecolor": [colour_of(u) for u in corners for _ in faces],
+        "facecolor": [colour_of(u) for u, of in zip(corners, faces, strict=True) for _ in of],
         **points_of(np.concatenate([*corners.values()])),
         **dict(zip("ijk", every.T.tolist(), strict=True)),
     }

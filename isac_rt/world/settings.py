@@ -25,8 +25,6 @@ from isac_rt.settings import (
 MAX_SPEED_MPS = 1e4
 """Nothing in the air is faster. Doppler shifts are modelled to the first order in v/c, which is
 3e-5 here."""
-
-
 SOUND_MPS = 340.0
 """Speed of sound, below which tips of blades stay."""
 
@@ -185,30 +183,14 @@ class City(Node):
 
 
 _BUILT = frozenset({"street_width_m", "building_height_m", "height_spread_m", "block_size_m"})
-
-
 _SURFACES = frozenset({"wall_material", "roof_material", "ground_material", "ground_margin_m"})
-
-
 CITY_KEYS: dict[str, frozenset[str]] = {
     "builtin": frozenset({"name"}),
     "mitsuba": frozenset({"file"}),
     "mesh": frozenset({"file", "up_axis", "scale", "origin", "material", "material_map"}),
-    "footprints": frozenset(
-        {
-            "file",
-            "layer",
-            "lod",
-            "coordinates",
-            "crs",
-            "origin",
-            "terrain",
-            "height_property",
-            "default_height_m",
-            "material_map",
-        }
-    )
-    | _SURFACES,
+    "footprints": _SURFACES
+    | {"file", "layer", "lod", "coordinates", "crs", "origin", "terrain", "height_property"}
+    | {"default_height_m", "material_map"},
     "canyon": _BUILT | _SURFACES | {"street_length_m"},
     "blocks": _BUILT | _SURFACES | {"blocks_x", "blocks_y"},
 }
@@ -255,8 +237,6 @@ class Rcs(Node):
 
 MOST_BLADES_M = 8.0
 """Length of all blades of a UAV together [m]; 1 m is 1,000 points in each slot, 0.2 GB a frame."""
-
-
 NEAREST_BLADE_M = 0.05
 """Least distance of a terminal's blades from its arrays [m]: a few of the arrays' own size."""
 
@@ -406,13 +386,27 @@ class Extent(Node):
 
 
 class Box(Node):
-    """Closed box about a UAV's position that shadows and mirrors, such as a car or a tram."""
+    """Closed box about a UAV's position that shadows and mirrors, such as a car or a tram, or a
+    convex solid in its place."""
 
-    size_m: tuple[Side, Side, Side]
+    size_m: tuple[Side, Side, Side] | None = None
     """Width, length and height [m], along right, ahead and up of the UAV's body."""
+    corners_m: tuple[Vector, ...] | None = None
+    """Corners of a convex solid in place of `size_m`: to the right, ahead, up of the UAV's position
+    [m]."""
+    file: str | None = None
+    """Closed mesh in place of `size_m`, in metres, y ahead, z up (glTF: y up), its middle at the
+    UAV's position: PLY, OBJ, STL, glTF or GLB. Its convex hull is taken."""
     material: str = "metal"
     """Material of all faces, by its name in the table of materials or in `city.materials`. By
     default metal, as of a car."""
+
+    def problems(self) -> Iterator[Problem]:
+        if self.file is not None:
+            yield Problem((("file",),), "is read by isac_rt.load, which was not used; state size_m")
+        elif (self.size_m is None) == (self.corners_m is None):
+            text = "a box has one of size_m, corners_m and file; state one"
+            yield Problem((("size_m",), ("corners_m",)), text)
 
 
 class Waypoint(Node):

@@ -13,7 +13,8 @@ import numpy as np
 from isac_rt.extensions.street.centres import attitude_about, body_axes
 from isac_rt.extensions.street.faces import Box, Mirrors
 from isac_rt.extensions.street.occlusion import Occlusion
-from isac_rt.extensions.street.shadows import CORNERS, STEP, Shadows
+from isac_rt.extensions.street.shadows import STEP, Shadows
+from isac_rt.extensions.street.solid import Solid, solid_of_box
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.free_space import FreeSpace
@@ -55,7 +56,7 @@ class Boxes:
         self.model, self._swarm, self._free = model, swarm, free
         self._half_frame = waveform.frame_duration / 2
         self._occlusion = Occlusion(city, waveform.carrier_frequency)
-        self._shapes: dict[str, tuple[np.ndarray, Material]] = {}
+        self._shapes: dict[str, tuple[Solid, Material]] = {}
         for name, uav in swarm.uavs.items():
             if uav.box is not None:
                 use = MaterialUse(uav.box.material)
@@ -63,7 +64,7 @@ class Boxes:
                     _, (material,) = resolve_materials([use], waveform.carrier_frequency, changes)
                 except CityError as problem:
                     raise CityError(f"swarm.{name}.box.material: {problem}") from None
-                self._shapes[name] = np.array(uav.box.size_m) / 2, material
+                self._shapes[name] = solid_of_box(name, uav.box), material
 
     def census(self) -> Census:
         """Return the census of the underlying model."""
@@ -72,36 +73,34 @@ class Boxes:
     def trace(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Traced:
         """Return the model's paths and those over faces, shadowed."""
         found, dropped = self.model.trace(poses, epoch, links)
-        out = {}
-        boxes = self._boxes(poses, epoch)
+        out, boxes = {}, self._boxes(poses, epoch)
         mirrors = Mirrors(boxes, self._free, self._occlusion, self._half_frame)
         for link, paths in found.items():
-            state = LinkState(link, epoch, poses[link.tx], poses[link.rx], paths.target_names)
-            mirrored = mirrors.between_terminals(state), mirrors.echoes(state, poses)
+            shadows = self._shadows(paths, poses, boxes)
+            mirrored = (
+                mirrors.between_terminals(shadows.state),
+                mirrors.echoes(shadows.state, poses),
+            )
             lit = merge([paths, *itertools.chain(*mirrored)])
-            shadows = Shadows(boxes, state, poses, self._free.wavelength, self._half_frame)
             out[link] = replace(lit, gain=lit.gain * shadows.factor(lit))
         return Traced(out, dropped)
 
     def shadows(self, paths: PathSet, poses: dict[str, Pose]) -> Shadows:
         """Return the shadows on a link's paths at their epoch."""
-        (tx, rx), epoch = paths.link, paths.epoch
-        state = LinkState(paths.link, epoch, poses[tx], poses[rx], paths.target_names)
-        boxes = self._boxes(poses, epoch)
+        return self._shadows(paths, poses, self._boxes(poses, paths.epoch))
+
+    def _shadows(self, paths: PathSet, poses: dict[str, Pose], boxes: list[Box]) -> Shadows:
+        (tx, rx), names = paths.link, paths.target_names
+        state = LinkState(paths.link, paths.epoch, poses[tx], poses[rx], names)
         return Shadows(boxes, state, poses, self._free.wavelength, self._half_frame)
 
     def _boxes(self, poses: dict[str, Pose], epoch: float) -> list[Box]:
         """Return the boxes at an instant."""
-        swarm, names = self._swarm, list(self._swarm.uavs)
-        return [
-            Box(
-                names.index(name),
-                *shape,
-                poses[name],
-                attitude_about(swarm, name, epoch, TURN_STEP),
-            )
-            for name, shape in self._shapes.items()
-        ]
+        out, names = [], list(self._swarm.uavs)
+        for name, shape in self._shapes.items():
+            attitude = attitude_about(self._swarm, name, epoch, TURN_STEP)
+            out.append(Box(names.index(name), *shape, poses[name], attitude))
+        return out
 
     def report(
         self, frames: Sequence[tuple[dict[str, Pose], Mapping[Link, PathSet]]]
@@ -126,15 +125,11 @@ class Boxes:
 
 
 def box_corners(swarm: Swarm, times: Sequence[float]) -> dict[str, np.ndarray]:
-    """Return the corners (T, 8, 3) of a swarm's boxes at some times [s], by UAV."""
-    return {
-        name: np.array(
-            [
-                swarm.trajectories[name].pose(t).position
-                + (CORNERS * uav.box.size_m / 2) @ body_axes(swarm, name, t).T
-                for t in times
-            ]
-        )
-        for name, uav in swarm.uavs.items()
-        if uav.box is not None
-    }
+    """Return the corners (T, V, 3) of a swarm's boxes at some times [s], by UAV."""
+    out = {}
+    for name, uav in swarm.uavs.items():
+        if uav.box is not None:
+            corners, flight = solid_of_box(name, uav.box).corners, swarm.trajectories[name]
+            axes = np.array([body_axes(swarm, name, t) for t in times])
+            out[name] = flight.positions(np.asarray(times))[:, None] + corners @ axes.swapaxes(1, 2)
+    return out

@@ -116,13 +116,12 @@ class MovingCentres:
                 faded = np.ones((len(bases), time.size))
                 if shadow is not None:
                     row = np.repeat([base.row for base in bases], time.size)
-                    faded = shadow(paths.select(row), np.tile(time, len(bases)))
-                    faded = faded.reshape(len(bases), -1)
+                    faded = shadow(paths.select(row), np.tile(time, len(bases))).reshape(
+                        faded.shape
+                    )
                 for base, fade in zip(bases, faded, strict=True):
                     amplitudes = model.amplitudes(*base.towards, paths.epoch + time)
-                    if shadow is not None:
-                        amplitudes = amplitudes * fade[:, None]
-                    parts.append(_copies(base, amplitudes, offset, begin, time))
+                    parts.append(_copies(base, amplitudes * fade[:, None], offset, begin, time))
         own = self.own_echoes(paths, poses, later)
         if own is not None and (own.power.sum() > least_power * self.waveform.num_chirps):
             parts.append(own)
@@ -177,17 +176,10 @@ class MovingCentres:
         received = columns["gain"].any(axis=0)
         if not received.any():
             return None
-        at_arrays = make_paths(
-            tx=name,
-            rx=name,
-            epoch=paths.epoch,
-            target_names=paths.target_names,
-            kind=PathKind.LEAKAGE,
-            gain=[1.0],
-            delay=[0.0],
-            departure=[axes[1]],
-            arrival=[axes[1]],
-        )
+        about: dict[str, Any] = {"epoch": paths.epoch, "target_names": paths.target_names}
+        about |= {"kind": PathKind.LEAKAGE, "gain": [1.0], "delay": [0.0]}
+        about |= {"departure": [axes[1]], "arrival": [axes[1]]}
+        at_arrays = make_paths(tx=name, rx=name, **about)
         return _pieces(at_arrays, columns, begin, time).select(np.tile(received, time.size))
 
     def report(
@@ -251,12 +243,8 @@ class MovingCentres:
                 f"{10 * np.log10(power):.0f} dB over the noise of a cell; Doppler to {edge:.4g} Hz "
                 f"either side, slots show {widest:.4g} Hz"
             )
-        return {
-            "modelled": f"{parts}, {seen}",
-            "left_out": left_out,
-            "estimate": error,
-            "unit": "rad",
-        }
+        row = {"modelled": f"{parts}, {seen}", "left_out": left_out}
+        return {**row, "estimate": error, "unit": "rad"}
 
     def _slots_of_piece(
         self,
@@ -450,15 +438,8 @@ def _end_image(end: Pose, uav: Pose, points: np.ndarray, faces: np.ndarray) -> E
         if face >= 0:
             normal = _unit(after - before)
             mirror = mirror @ (np.eye(3) - 2 * np.outer(normal, normal))
-    place = -length.sum() * along[-1]
-    motion = [
-        mirror.T @ own - of_uav
-        for own, of_uav in (
-            (end.velocity, uav.velocity),
-            (end.acceleration, uav.acceleration),
-        )
-    ]
-    return EndImage(-along[-1], Motion(place, *motion), mirror)
+    motion = end.motion()[1:] @ mirror - uav.motion()[1:]
+    return EndImage(-along[-1], Motion(-length.sum() * along[-1], *motion), mirror)
 
 
 class Segment(NamedTuple):

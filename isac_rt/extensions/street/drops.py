@@ -40,11 +40,8 @@ def permittivity(frequency: float, kelvin: float) -> complex:
     middle, optical = 0.0671 * static, 3.52
     first = 20.20 - 146 * excess + 316 * excess**2
     second = 39.8 * first
-    return (
-        (static - middle) / (1 - 1j * f / first)
-        + (middle - optical) / (1 - 1j * f / second)
-        + optical
-    )
+    main = (static - middle) / (1 - 1j * f / first)
+    return main + (middle - optical) / (1 - 1j * f / second) + optical
 
 
 def fall_speed(diameter_mm: np.ndarray) -> np.ndarray:

@@ -398,10 +398,5 @@ def plan_row(
     level = f"floor {rise:.2g} dB up: {100 * (over > 1).mean():.2g} % of the samples over the noise"
     if over.max() > 1:
         level += f", {most:.3g} dB at most"
-    left = 10 * np.log10(WEAKEST)
-    return {
-        "modelled": level,
-        "left_out": "weak paths; two bounces, clutter",
-        "estimate": left,
-        "unit": "dB",
-    }
+    row = {"modelled": level, "left_out": "weak paths; two bounces, clutter"}
+    return row | {"estimate": 10 * np.log10(WEAKEST), "unit": "dB"}

@@ -15,12 +15,13 @@ import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from isac_rt.extensions.street.centres import Attitude
 from isac_rt.extensions.street.occlusion import Occlusion
+from isac_rt.extensions.street.solid import Solid
 from isac_rt.propagation.free_space import FreeSpace, friis_amplitude, radar_amplitude
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
@@ -43,14 +44,14 @@ class Box(NamedTuple):
     Attributes
     ----------
     number : place of the UAV among all
-    half : (3,) half its width, length and height [m]
+    solid : its shape
     material : of its faces
     pose : of its middle
     attitude : of its axes
     """
 
     number: int
-    half: np.ndarray
+    solid: Solid
     material: Material
     pose: Pose
     attitude: Attitude
@@ -112,8 +113,8 @@ class Mirrors:
             ways = ScatterPaths.along(stretch.segments)
             gain = stretch.factor * friis_amplitude(self.free.wavelength, ways.length)
             gain = gain * state.elements(self.free.arrays, ways)
-            box, met = FIRST_BOX - int(stretch.faces[0]), _met([stretch])
-            yield _alive(state.paths(ways, gain, PathKind.SPECULAR, target=box, **met), [stretch])
+            box = FIRST_BOX - int(stretch.faces[0])
+            yield _path(state, ways, (gain, PathKind.SPECULAR, box), [stretch])
 
     def echoes(self, state: LinkState, poses: dict[str, Pose]) -> Iterator[PathSet]:
         """Yield the echoes of UAVs over one face or two."""
@@ -143,8 +144,7 @@ class Mirrors:
         ways = ScatterPaths.over(to, on)
         gain = radar_amplitude(self.free.wavelength, section, to.length, on.length)
         gain = gain * there.factor * back.factor * state.elements(self.free.arrays, ways)
-        met = _met([there, pose.position, back])
-        yield _alive(state.paths(ways, gain, PathKind.GHOST, target=index, **met), [there, back])
+        yield _path(state, ways, (gain, PathKind.GHOST, index), [there, back], pose.position)
 
     def _straight(self, state: LinkState) -> Iterator[Stretch]:
         """Yield the straight segment from start to end, unless the city hides it."""
@@ -156,16 +156,16 @@ class Mirrors:
         """Yield the segments from start to end over faces; the middle of a box is before none."""
         for box, axes in zip(self.boxes, self._axes, strict=True):
             margin = margins(box, axes, (state.start, state.end), self._time)
-            for axis, side in zip(*np.nonzero((margin > 0).any(axis=0)), strict=True):
-                stretch = self._stretch(state, box, int(axis), float(2 * side - 1))
+            for face in np.flatnonzero((margin > 0).any(axis=0)):
+                stretch = self._stretch(state, box, box.solid.planes[face])
                 if not self.occlusion.hidden(state, stretch.points)[0]:
-                    for begin, end in lives(self._time, margin[:, axis, side]):
+                    for begin, end in lives(self._time, margin[:, face]):
                         yield stretch._replace(begin=begin, end=end)
 
-    def _stretch(self, state: LinkState, box: Box, axis: int, sign: float) -> Stretch:
-        """Return the segment over a face, by Fresnel's coefficients."""
-        normal = sign * box.attitude.axes[None, :, axis]
-        image = face_image(state.start, box, axis, sign)
+    def _stretch(self, state: LinkState, box: Box, plane: np.ndarray) -> Stretch:
+        """Return the segment over the face in a plane (4,), by Fresnel's coefficients."""
+        normal = (box.attitude.axes @ plane[:3])[None]
+        image = face_image(state.start, box, plane)
         segment = straight(image, *state.end.motion()[:, None])
         out, arrival = segment.departure, segment.arrival
         along = mirror_image(out, normal)
@@ -180,32 +180,35 @@ class Mirrors:
         )
 
 
-def _met(stations: Sequence[Stretch | np.ndarray]) -> dict[str, Any]:
-    """Return the interactions of one path: those of segments, the last of them turned round, and a
-    UAV's place between."""
-    ends = [s for s in stations if isinstance(s, Stretch)]
-    points = [s.points if isinstance(s, Stretch) else s[None] for s in stations]
-    faces = [s.faces if isinstance(s, Stretch) else np.array([-1]) for s in stations]
-    return {
-        "points": np.concatenate(points)[None],
-        "faces": np.concatenate(faces)[None],
-        "bounces": sum(len(s.points) for s in ends),
-    }
-
-
-def _alive(paths: PathSet, stretches: Sequence[Stretch]) -> PathSet:
-    """Return a path while all of its segments live."""
-    begin, end = (max(s.begin for s in stretches), min(s.end for s in stretches))
+def _path(
+    state: LinkState,
+    ways: ScatterPaths,
+    about: tuple[np.ndarray, PathKind, int],
+    met: Sequence[Stretch],
+    place: np.ndarray | None = None,
+) -> PathSet:
+    """Return one path of a gain, kind and target while all segments live that it has met, a UAV's
+    place between them."""
+    points, faces = [one.points for one in met], [one.faces for one in met]
+    bounces = sum(map(len, points))
+    if place is not None:
+        points.insert(1, place[None])
+        faces.insert(1, np.array([-1]))
+    gain, kind, target = about
+    along = {"points": np.concatenate(points)[None], "faces": np.concatenate(faces)[None]}
+    paths = state.paths(ways, gain, kind, target=target, bounces=bounces, **along)
+    begin, end = max(one.begin for one in met), min(one.end for one in met)
     return replace(paths, begin=np.full(len(paths), begin), end=np.full(len(paths), end))
 
 
-def face_image(end: Pose, box: Box, axis: int, sign: float) -> Pose:
-    """Return the image of an end behind a face, with velocity and acceleration."""
-    normal, spin = sign * box.attitude.axes[:, axis], box.attitude.rate
+def face_image(end: Pose, box: Box, plane: np.ndarray) -> Pose:
+    """Return the image of an end behind the face in a plane (4,), with velocity and
+    acceleration."""
+    normal, spin = box.attitude.axes @ plane[:3], box.attitude.rate
     turn = np.cross(spin, normal)
     twist = np.cross(box.attitude.accel, normal) + np.cross(spin, turn)
     place, velocity, acceleration = end.motion() - box.pose.motion()
-    height = normal @ place - box.half[axis]
+    height = normal @ place - plane[3]
     rise = turn @ place + normal @ velocity
     lift = twist @ place + 2 * turn @ velocity + normal @ acceleration
     return replace(
@@ -217,27 +220,27 @@ def face_image(end: Pose, box: Box, axis: int, sign: float) -> Pose:
 
 
 def margins(box: Box, axes: np.ndarray, ends: tuple[Pose, Pose], time: np.ndarray) -> np.ndarray:
-    """Return how far the reflections at the faces (3 axes, 2 sides) are from failing at times (T,)
-    [s since the epoch], (T, 3, 2): the least of both ends' heights over the face and of the point's
-    distances from its rim [m].
+    """Return how far the reflections at the faces (F,) are from failing at times (T,) [s since the
+    epoch], (T, F): the least of both ends' heights over the face and of the point's depths under
+    the planes of all others [m].
 
     Parameters
     ----------
     axes : (T, 3, 3) of the box
     """
-    sides, t, places = np.array([-1.0, 1.0]), time[:, None], []
+    t, solid, heights, feet = time[:, None], box.solid, [], []
     for end in ends:
         place, velocity, acceleration = end.motion() - box.pose.motion()
         offset = place + (velocity + acceleration * t / 2) * t
-        places.append((offset[:, None] @ axes)[:, 0, :, None])
-    first, last = places
-    over, under = (place * sides - box.half[:, None] for place in (first, last))
-    high, low = np.maximum(over, TINY), np.maximum(under, TINY)
-    share = (high / (high + low))[..., None, :]  # (T, axis, 1, side)
-    across = first[:, None] + share * (last - first)[:, None]  # (T, axis, coordinate, side)
-    beside = box.half[:, None] - np.abs(across)
-    beside[:, np.arange(3), np.arange(3)] = np.inf
-    return np.minimum(np.minimum(over, under), beside.min(axis=2))
+        from_box = (offset[:, None] @ axes)[:, 0]
+        heights.append(-solid.depths(from_box))
+        feet.append(from_box[:, None] - heights[-1][..., None] * solid.planes[:, :3])
+    high, low = np.maximum(heights, TINY)
+    share = (high / (high + low))[..., None]
+    beside = solid.depths(feet[0] + share * (feet[1] - feet[0]))
+    own = np.arange(len(solid.planes))
+    beside[:, own, own] = np.inf
+    return np.minimum(np.min(heights, axis=0), beside.min(axis=2))
 
 
 def lives(time: np.ndarray, margin: np.ndarray) -> list[tuple[float, float]]:

@@ -150,9 +150,8 @@ class Plates(Blades):
         if not towards:
             return out
         lobes = self.wave_number * r.blade_length_m / np.pi
-        edges = (
-            blades * blade_section(as_wires(r)) / (2 * lobes)
-        )  # mean of a sinc squared over a turn
+        # mean of a sinc squared over a turn
+        edges = blades * blade_section(as_wires(r)) / (2 * lobes)
         ratio = self.mean_section(*towards) / edges
         return f"{out}, {10 * np.log10(max(ratio, DARK)):+.0f} dB against their edges as wires"
 

@@ -18,7 +18,6 @@ one Fresnel unit changes the factor by one at most. Pieces, all of one length, a
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -40,9 +39,6 @@ RIPPLE_REACH = 1 / (np.sqrt(2) * np.pi * STEP)
 """Fresnel units from an edge beyond which its ripple is below `STEP`."""
 SWEEPS = 20
 """Sweeps for the velocities of chains of reflections: 1e-12 of two, 1e-6 of three in turn."""
-CORNERS = np.array(list(itertools.product((-1, 1), repeat=3)))
-EDGES = np.array([e for e in itertools.combinations(range(8), 2) if (e[0] ^ e[1]) in (1, 2, 4)])
-"""Pairs of corners that differ in one sign."""
 
 
 class Part(NamedTuple):
@@ -254,12 +250,13 @@ def screen(
     at = np.clip((to * along).sum(1), 0, length)
     off = np.linalg.norm(to - at[:, None] * along, axis=1)
     largest_unit = np.sqrt(wavelength * total / 8)
-    near = np.flatnonzero(off < np.linalg.norm(box.half) + LIT_REACH * largest_unit + reach)
+    near = np.flatnonzero(off < box.solid.reach + LIT_REACH * largest_unit + reach)
     axes = box.attitude.axes_at(time[rows[near]])
-    corners = centre[near, None] + (CORNERS * box.half) @ axes.swapaxes(1, 2)
+    corners = centre[near, None] + box.solid.corners @ axes.swapaxes(1, 2)
     up = vertical(along[near])
     basis = np.stack([np.cross(along[near], up), along[near], up], axis=2)  # level, along, across
-    low, high = extent_between((corners - starts[near, None]) @ basis, length[near])
+    a, b = ((corners - starts[near, None]) @ basis)[:, box.solid.edges.T].swapaxes(0, 1)
+    low, high = extent_between(a, b, length[near])
     between = np.isfinite(low[:, 1])
     near, low, high = near[between], low[between], high[between]
     middle = before[near] + (low[:, 1] + high[:, 1]) / 2
@@ -268,10 +265,11 @@ def screen(
     return rows[near], low[:, ::2] / unit, high[:, ::2] / unit
 
 
-def extent_between(corners: np.ndarray, length: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and greatest coordinates (K, 3) of boxes, by their corners (K, 8, 3), where
-    the second coordinate is from 0 to `length` (K,); not finite where it never is."""
-    a, b = corners[:, EDGES[:, 0]], corners[:, EDGES[:, 1]]
+def extent_between(
+    a: np.ndarray, b: np.ndarray, length: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and greatest coordinates (K, 3) of solids, by both ends (K, E, 3) of their
+    edges, where the second coordinate is from 0 to `length` (K,); not finite where it never is."""
     rise = (b - a)[..., 1]
     rise = np.where(rise == 0, TINY, rise)
     with np.errstate(over="ignore"):  # to infinity, with the right sign

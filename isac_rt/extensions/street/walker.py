@@ -10,6 +10,7 @@ cross-section alike.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -119,22 +120,12 @@ def walker_of(height: float, speed: float, section: float, start: float) -> Walk
     rate = 2 * np.pi / CYCLE * np.sqrt(speed / leg)
     step = speed * 2 * np.pi / rate / (4 * leg) if rate else 0.0
     swing = min(np.arcsin(min(step, 1.0)), LARGEST_SWING)
-    trunk = np.linspace(0, (1 - LEG) * height, POINTS["trunk"])
-    parts = [(np.stack([0 * trunk, 0 * trunk, trunk], axis=1), 0 * trunk, 0.0, 0.0)]
-    for side in (1, -1):
-        for kind, size, x, z in (
-            ("leg", LEG, HIP_X, 0.0),
-            ("arm", ARM, SHOULDER_X, SHOULDER - LEG),
-        ):
-            below = np.linspace(0, size * height, POINTS[kind] + 1)[1:]
-            hinge = np.broadcast_to([side * x * height, 0.0, z * height], (below.size, 3))
-            opposite = (side < 0) != (kind == "arm")
-            parts.append((hinge, below, swing, start + np.pi * opposite))
-    return Walker(
-        np.concatenate([hinge for hinge, *_ in parts]),
-        np.concatenate([below for _, below, _, _ in parts]),
-        np.concatenate([np.full(below.size, angle) for _, below, angle, _ in parts]),
-        np.concatenate([np.full(below.size, phase) for _, below, _, phase in parts]),
-        rate,
-        section,
-    )
+    rows = [(0.0, z, 0.0, 0.0, 0.0) for z in np.linspace(0, 1 - LEG, POINTS["trunk"])]
+    limbs = ("leg", LEG, HIP_X, 0.0), ("arm", ARM, SHOULDER_X, SHOULDER - LEG)
+    for side, (kind, size, x, z) in itertools.product((1, -1), limbs):
+        phase = start + np.pi * ((side < 0) != (kind == "arm"))
+        below = np.linspace(0, size, POINTS[kind] + 1)[1:]
+        rows += [(side * x, z, length, swing, phase) for length in below]
+    x, z, length, swings, phases = np.array(rows).T
+    hinge = height * np.stack([x, 0 * x, z], axis=1)
+    return Walker(hinge, height * length, swings, phases, rate, section)

@@ -39,9 +39,9 @@ _NAMED = 20
 """Most names that a message lists."""
 _SOLID = re.compile(r"^[ \t]*solid\b", re.MULTILINE | re.IGNORECASE)
 _VERTEX = re.compile(r"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
-_Y_UP = (".glb", ".gltf")
+Y_UP = (".glb", ".gltf")
 """Formats whose standard has y up."""
-_Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
 @dataclass(frozen=True)
@@ -309,7 +309,7 @@ def pieces(path: Path, formats: tuple[str, ...] = MESHES) -> Iterator[Piece]:
 
 def mesh_files(path: Path) -> list[Path]:
     """A mesh file and those that it is read from."""
-    if path.suffix.lower() not in _Y_UP:
+    if path.suffix.lower() not in Y_UP:
         return [path]
     with _readable(path):
         named = [_buffer_file(path, buffer) for buffer in _gltf(path)[0].get("buffers", [])]
@@ -343,7 +343,7 @@ def _listed(names: Counter[str], unit: str) -> str:
 
 
 def _is_y_up(city: settings.City, path: Path) -> bool:
-    return city.up_axis == "y" or (city.up_axis == "auto" and path.suffix.lower() in _Y_UP)
+    return city.up_axis == "y" or (city.up_axis == "auto" and path.suffix.lower() in Y_UP)
 
 
 def mesh_georeference(city: settings.City, path: Path) -> GeoReference | None:
@@ -356,7 +356,7 @@ def point_in_file(
     city: settings.City, path: Path, point: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return a world point (3,) [m] in the coordinates and units of a mesh file."""
-    turned = point @ _Y_UP_TO_Z_UP if _is_y_up(city, path) else point
+    turned = point @ Y_UP_TO_Z_UP if _is_y_up(city, path) else point
     return turned / city.scale + (city.origin or 0.0)
 
 
@@ -370,7 +370,7 @@ def mesh_file(
     A piece's material is what `material_map` says of its node, geometry or material name, else a
     known material of that name, else `material`."""
     seen, notes, unknown, guessed = set[str](), list[str](), Counter[str](), Counter[str]()
-    gltf, origin = path.suffix.lower() in _Y_UP, city.origin or (0.0, 0.0, 0.0)
+    gltf, origin = path.suffix.lower() in Y_UP, city.origin or (0.0, 0.0, 0.0)
     y_up = _is_y_up(city, path)
 
     def surfaces() -> Iterator[Surface]:
@@ -380,7 +380,7 @@ def mesh_file(
                 continue
             vertices = (piece.vertices - origin) * city.scale
             if y_up:
-                vertices = vertices @ _Y_UP_TO_Z_UP.T
+                vertices = vertices @ Y_UP_TO_Z_UP.T
             seen.update(piece.labels)
             use = _use(piece.labels, city, path.name, guessed)
             if use is None:
