@@ -42,8 +42,8 @@ class Job:
         assert uav.waypoints is not None
         section = 10 ** (uav.rcs.value_dbsm / 10)
         speed = float(np.linalg.norm(self.frame.poses["person"].velocity))
-        self.walker = walker_of(HIP_M / 0.53, speed, section, 0.4)
-        self.amplitudes = self.walker.amplitudes(np.zeros(3), np.zeros(3), np.zeros(1))
+        self.walker = walker_of(HIP_M / 0.53, speed, section, np.random.default_rng(4))
+        self.amplitudes = self.walker.amplitude.conj()
         centres = [("person", self.walker)]
         self.moving = MovingCentres(s.swarm, s.reference.sections, s.waveform, s.arrays, centres)
 

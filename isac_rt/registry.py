@@ -158,6 +158,7 @@ EXTENSIONS = {
     "excised": "isac_rt.extensions.street.excision:excised",
     "boxes": "isac_rt.extensions.street.boxes:Boxes",
     "box_corners": "isac_rt.extensions.street.boxes:box_corners",
+    "section_of_extent": "isac_rt.extensions.street.extent:section_of",
     "corners_of_mesh": "isac_rt.extensions.street.solid:corners_of_mesh",
     "solid_of_box": "isac_rt.extensions.street.solid:solid_of_box",
     "weather": "isac_rt.extensions.street.weather:Weathered",

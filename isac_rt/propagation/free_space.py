@@ -16,7 +16,8 @@ from isac_rt.propagation.pathset import PathKind, PathSet, merge
 from isac_rt.propagation.rcs import CrossSection
 from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
 from isac_rt.propagation.segments.geometry import Segments, straight
-from isac_rt.world.settings import Uav
+from isac_rt.registry import extension
+from isac_rt.world.settings import Rcs, Uav
 from isac_rt.world.swarm import Pose
 
 
@@ -54,8 +55,13 @@ class FreeSpace:
 
     @cached_property
     def sections(self) -> dict[str, CrossSection]:
-        """Cross-section of every UAV."""
-        return {name: CrossSection(uav.rcs, name, self.seed) for name, uav in self.uavs.items()}
+        """Cross-section of every UAV: as stated, or that of its extent."""
+        return {
+            name: CrossSection(uav.rcs, name, self.seed)
+            if uav.extent is None or uav.rcs != Rcs()
+            else extension("section_of_extent")(uav.extent, self.seed, name)
+            for name, uav in self.uavs.items()
+        }
 
     def trace(self, poses: dict[str, Pose], epoch: float, links: list[Link]) -> Traced:
         """Paths of every link; those that no element sends or receives are left out."""

@@ -111,11 +111,9 @@ class PathSet:
         kinds = ", ".join(
             f"{count} {name.replace('_', ' ')}" for name, count in self.counts().items() if count
         )
-        spans = (
-            f", {self.delay.min() * 1e9:.1f} to {self.delay.max() * 1e9:.1f} ns"
-            if len(self)
-            else ""
-        )
+        spans = ""
+        if len(self):
+            spans = f", {self.delay.min() * 1e9:.1f} to {self.delay.max() * 1e9:.1f} ns"
         return (
             f"<PathSet {self.tx} -> {self.rx} at {self.epoch:.4f} s: {kinds or 'no paths'}{spans}>"
         )

@@ -244,15 +244,11 @@ class RayTracer:
         depth = p.max_bounces if self._city.num_faces else 0
         sources = {name: local[name].position for name in self._terminals}
         sinks = {name: local[name].position for name in self._free.names}
-        beside = (
-            {
-                f"{name}-{k}": position + step
-                for name, position in sources.items()
-                for k, step in enumerate(PROBES_M)
-            }
-            if depth > 1
-            else {}
-        )
+        beside = {
+            f"{name}-{k}": position + step
+            for name, position in sources.items()
+            for k, step in enumerate(PROBES_M if depth > 1 else ())
+        }
         paths = self._solve(
             sources,
             sinks | beside,

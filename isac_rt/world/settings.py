@@ -487,7 +487,7 @@ class Uav(Node):
     """Direction [x, y, z] that the arrays look in, of any length, or `velocity`, the default: where
     the UAV flies to. Targets outside the field of view about it are not seen."""
     rcs: Rcs = Rcs()
-    """Radar cross-section of the UAV: how strong its echo is. By default that of a small UAV."""
+    """Radar cross-section: how strong the echo is. By default that of `extent` or a small UAV."""
     rotors: Rotors | None = None
     """Rotors whose blades modulate the UAV's echo. null, the default: none."""
     extent: Extent | None = None

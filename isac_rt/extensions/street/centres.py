@@ -144,7 +144,7 @@ class MovingCentres:
             )
             towards = images[0].towards @ attitude.axes, images[1].towards @ attitude.axes
             gain = path.gain / np.sqrt(section)
-            power = float(np.abs(gain[0]) ** 2 * model.mean_section(*towards))
+            power = float(np.abs(gain[0]) ** 2 * model.square_metres(*towards))
             out.append(Base(int(row), path, *images, towards, gain, power))
         return out
 

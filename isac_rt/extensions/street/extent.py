@@ -13,13 +13,14 @@ sum is coherent over frames. Centres lie in the middle of the faces.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from isac_rt.extensions.street.motion import Motion
+from isac_rt.extensions.street.walker import HUMAN_DBSM
 from isac_rt.propagation.rcs import (
     LARGE_BISTATIC,
     LARGE_LOBES,
@@ -83,7 +84,7 @@ class Fixed:
     """
 
     places: np.ndarray
-    sections: tuple[Callable[[np.ndarray, np.ndarray], Any], ...]
+    sections: tuple[CrossSection, ...]
     phases: Mapping[int, tuple[AspectTable, AspectTable]] = field(default_factory=dict)
 
     replaces_echo: ClassVar[bool] = True
@@ -99,8 +100,8 @@ class Fixed:
         self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
     ) -> np.ndarray:
         """(K,) square root of each centre's cross-section [m], with its phase."""
-        sections = np.ravel([section(incident, observed) for section in self.sections])
-        out = np.sqrt(sections).astype(complex)
+        each = [section.square_metres(incident, observed) for section in self.sections]
+        out = np.sqrt(np.ravel(each)).astype(complex)
         total = incident + observed
         bisector = total / max(float(np.linalg.norm(total)), 1e-9)
         for k, (cosine, sine) in self.phases.items():
@@ -108,9 +109,9 @@ class Fixed:
             out[k] *= np.exp(1j * np.angle(phasor).item())
         return out
 
-    def mean_section(self, incident: np.ndarray, observed: np.ndarray) -> float:
-        """Return the cross-section of all centres, added by power [m^2]."""
-        return float(np.sum([section(incident, observed) for section in self.sections]))
+    def square_metres(self, incident: np.ndarray, observed: np.ndarray) -> Any:
+        """Return the cross-section (...) of all centres, added by power [m^2]."""
+        return sum(section.square_metres(incident, observed) for section in self.sections)
 
     def motion(self, time: np.ndarray) -> Motion:
         """Return the centres' places, at rest."""
@@ -118,21 +119,22 @@ class Fixed:
         return Motion(self.places + rest, rest, rest)
 
 
-@dataclass(frozen=True)
-class Section:
-    """Cross-section of one centre: a lobe times a random field."""
+class Section(CrossSection):
+    """Cross-section of one centre: a lobe with a random field."""
 
-    lobe: Lobe
-    bistatic: tuple[float, float]
-    random: CrossSection
+    def __init__(self, lobe: Lobe, kind: Kind, name: str, seed: int) -> None:
+        super().__init__(Rcs(model="constant", fluctuation_db=kind.std_db), name, seed)
+        self.lobe, self._bistatic = lobe, kind.bistatic
 
-    def __call__(self, incident: np.ndarray, observed: np.ndarray) -> float:
-        """Return the cross-section [m^2]."""
-        total = incident + observed
-        norm = float(np.linalg.norm(total))
-        bisector, half = total / max(norm, 1e-9), np.arccos(np.clip(norm / 2, 0.0, 1.0))
-        value = 10 ** (float(lobe_db(self.lobe, self.bistatic, bisector, half)) / 10)
-        return value * float(self.random.square_metres(incident, observed))
+    def _mean_db(self, bisector: np.ndarray, half_bistatic: np.ndarray) -> np.ndarray:
+        return lobe_db(self.lobe, self._bistatic, bisector, half_bistatic)
+
+
+def section_of(extent: Extent, seed: int, name: str) -> Fixed | CrossSection:
+    """Return the cross-section of a target by aspect, its centres added by power."""
+    if extent.kind == "pedestrian":
+        return CrossSection(Rcs(model="constant", value_dbsm=HUMAN_DBSM), name, seed)
+    return fixed_of(extent, seed, name)
 
 
 def fixed_of(extent: Extent, seed: int, name: str) -> Fixed:
@@ -141,11 +143,7 @@ def fixed_of(extent: Extent, seed: int, name: str) -> Fixed:
         return stated(extent.centres)
     kind = KINDS[extent.kind]
     lobes = of_several(kind.lobes)
-    random = Rcs(model="constant", value_dbsm=0.0, fluctuation_db=kind.std_db)
-    sections = (
-        Section(lobe, kind.bistatic, CrossSection(random, f"{name}/{i}", seed))
-        for i, lobe in enumerate(lobes)
-    )
+    sections = (Section(lobe, kind, f"{name}/{i}", seed) for i, lobe in enumerate(lobes))
     size = np.array(extent.size_m or kind.size)
     return Fixed(np.array([_outward(lobe) for lobe in lobes]) * size / 2, tuple(sections))
 
@@ -166,7 +164,7 @@ def stated(centres: Sequence[Centre]) -> Fixed:
             cosine, sine = (table.model_copy(update={"values_db": part}) for part in parts)
             phases[k] = cosine, sine
     places = np.array([c.position_m for c in centres])
-    return Fixed(places, tuple(CrossSection(rcs, "", 0).square_metres for rcs in sections), phases)
+    return Fixed(places, tuple(CrossSection(rcs, "", 0) for rcs in sections), phases)
 
 
 def of_several(lobes: tuple[Lobe, ...]) -> list[Lobe]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -52,7 +52,7 @@ class CentreModel(Protocol):
         vectors (3,) in the body's axes; (T, K) where it changes with time (T,) [s]."""
         ...
 
-    def mean_section(self, incident: np.ndarray, observed: np.ndarray) -> float:
+    def square_metres(self, incident: np.ndarray, observed: np.ndarray) -> Any:
         """Return the cross-section of all centres, added by power and over time [m^2]."""
         ...
 

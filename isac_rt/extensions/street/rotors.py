@@ -104,7 +104,7 @@ class Blades:
         """(K,) square root of each point's cross-section [m]."""
         return self.amplitude
 
-    def mean_section(self, incident: np.ndarray, observed: np.ndarray) -> float:
+    def square_metres(self, incident: np.ndarray, observed: np.ndarray) -> float:
         """Return the cross-section of all points, added by power [m^2]."""
         return float((self.amplitude**2).sum())
 
@@ -152,7 +152,7 @@ class Plates(Blades):
         lobes = self.wave_number * r.blade_length_m / np.pi
         # mean of a sinc squared over a turn
         edges = blades * blade_section(as_wires(r)) / (2 * lobes)
-        ratio = self.mean_section(*towards) / edges
+        ratio = self.square_metres(*towards) / edges
         return f"{out}, {10 * np.log10(max(ratio, DARK)):+.0f} dB against their edges as wires"
 
     def amplitudes(
@@ -168,7 +168,7 @@ class Plates(Blades):
         along = self.radius.size // (self.start.size * self.nodes.size)
         return np.asarray(self.amplitude * chord.reshape(time.size, -1).repeat(along, axis=1))
 
-    def mean_section(self, incident: np.ndarray, observed: np.ndarray) -> float:
+    def square_metres(self, incident: np.ndarray, observed: np.ndarray) -> float:
         """Return the mean cross-section of all blades over a turn [m^2]."""
         lobes = int(4 * self.wave_number * self.rotors.blade_length_m / np.pi) + 1
         angle = np.linspace(0, 2 * np.pi, ANGLES * lobes, endpoint=False)

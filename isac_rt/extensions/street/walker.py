@@ -5,7 +5,9 @@ A cycle of two steps lasts :math:`T = 1.346\sqrt{H/v}` at speed v with the hips 
 personification, 1990: relative length of a cycle 1.346 times the root of relative speed). Legs
 swing by :math:`\arcsin(vT/(4L))` about the hips, which spans a step; arms by as much about the
 shoulders in the opposite phase. Knees and elbows stay straight. All centres share the pedestrian's
-cross-section alike.
+cross-section alike, with phases of their own, as the places of a body's surface within a wavelength
+are unknown: they are drawn once, so that the sum over centres has that cross-section in the mean
+and is coherent over frames.
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ class Walker:
     swing : (K,) largest angle ahead [rad]
     phase : (K,) of the swing at time 0 [rad]
     rate : angular frequency of the cycle [rad/s]
-    section : cross-section of all points together [m^2]
+    amplitude : (K,) square root of each point's cross-section [m], with its phase
     """
 
     hinge: np.ndarray
@@ -53,7 +55,7 @@ class Walker:
     swing: np.ndarray
     phase: np.ndarray
     rate: float
-    section: float
+    amplitude: np.ndarray
 
     replaces_echo: ClassVar[bool] = True
     fading: ClassVar[float] = 0.0
@@ -77,11 +79,11 @@ class Walker:
         self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
     ) -> np.ndarray:
         """(K,) square root of each point's cross-section [m]."""
-        return np.full(self.length.size, np.sqrt(self.section / self.length.size))
+        return self.amplitude
 
-    def mean_section(self, incident: np.ndarray, observed: np.ndarray) -> float:
+    def square_metres(self, incident: np.ndarray, observed: np.ndarray) -> float:
         """Return the cross-section of all centres, added by power [m^2]."""
-        return self.section
+        return float((np.abs(self.amplitude) ** 2).sum())
 
     def motion(self, time: np.ndarray) -> Motion:
         """Return the points' motion in the body's axes at times (T,) [s]."""
@@ -103,20 +105,20 @@ HUMAN_DBSM, HEIGHT_M = -1.37, 1.75
 
 def walker_of_flight(extent: Extent, swarm: Swarm, seed: int, name: str) -> Walker:
     """Return the centres of a pedestrian who walks at the mean speed between the waypoints, with
-    a phase drawn by name."""
+    phases drawn by name."""
     flight, waypoints = swarm.trajectories[name], swarm.uavs[name].waypoints
     begin, end = (0.0, 1.0) if waypoints is None else (waypoints[0].time_s, waypoints[-1].time_s)
     times = np.linspace(begin, end, PLACES)
     way = np.linalg.norm(np.diff(flight.positions(times), axis=0), axis=1).sum()
     height = HEIGHT_M if extent.size_m is None else extent.size_m[2]
-    start = generator(seed, "walker", name).uniform(0, 2 * np.pi)
-    return walker_of(height, float(way) / (end - begin), 10 ** (HUMAN_DBSM / 10), start)
+    speed, rng = float(way) / (end - begin), generator(seed, "walker", name)
+    return walker_of(height, speed, 10 ** (HUMAN_DBSM / 10), rng)
 
 
-def walker_of(height: float, speed: float, section: float, start: float) -> Walker:
+def walker_of(height: float, speed: float, section: float, rng: np.random.Generator) -> Walker:
     """Return the centres of a pedestrian of a height [m] and a speed [m/s], whose position is the
-    height of the hips; `section` [m^2], and `start`: phase of the right leg at time 0 [rad]."""
-    leg = LEG * height
+    height of the hips, with a cross-section [m^2], and phases of steps and echoes from `rng`."""
+    leg, start = LEG * height, rng.uniform(0, 2 * np.pi)
     rate = 2 * np.pi / CYCLE * np.sqrt(speed / leg)
     step = speed * 2 * np.pi / rate / (4 * leg) if rate else 0.0
     swing = min(np.arcsin(min(step, 1.0)), LARGEST_SWING)
@@ -128,4 +130,5 @@ def walker_of(height: float, speed: float, section: float, start: float) -> Walk
         rows += [(side * x, z, length, swing, phase) for length in below]
     x, z, length, swings, phases = np.array(rows).T
     hinge = height * np.stack([x, 0 * x, z], axis=1)
-    return Walker(hinge, height * length, swings, phases, rate, section)
+    amplitude = np.sqrt(section / x.size) * np.exp(2j * np.pi * rng.uniform(size=x.size))
+    return Walker(hinge, height * length, swings, phases, rate, amplitude)

@@ -80,7 +80,7 @@ def test_limbs_move_as_their_places_say():
     assert (after.velocity - before.velocity) / (2 * h) == pytest.approx(now.acceleration, abs=1e-4)
     # a step is as long as the pedestrian walks in half a cycle
     speed = 1.4
-    person = moving.walker_of(1.75, speed, 1.0, 0.0)
+    person = moving.walker_of(1.75, speed, 1.0, np.random.default_rng(4))
     leg = person.length.max()
     assert 4 * leg * np.sin(person.swing.max()) == pytest.approx(speed * 2 * np.pi / person.rate)
 

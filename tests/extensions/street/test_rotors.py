@@ -304,7 +304,7 @@ def test_energy_of_flat_blades_is_that_of_the_integral():
     alone = blades_of(one, irt.Waveform(num_chirps=6), 1, "U")
     turns = np.arange(400) / 400 / (PLATES.rev_per_min / 60)
     power = np.abs(physical_optics(one, alone, turns, u1, u2)) ** 2
-    assert alone.mean_section(u1, u2) == pytest.approx(power.mean(), rel=1e-3)
+    assert alone.square_metres(u1, u2) == pytest.approx(power.mean(), rel=1e-3)
 
 
 def test_a_flat_blade_seen_from_its_edge_is_dark():
@@ -312,7 +312,7 @@ def test_a_flat_blade_seen_from_its_edge_is_dark():
     flat = blades_of(PLATES.model_copy(update={"incidence_deg": 0.0}), irt.Waveform(), 1, "U")
     ahead = np.array([0.0, 1.0, 0.0])
     assert np.abs(flat.amplitudes(ahead, ahead, np.linspace(0, 0.1, 7))).max() < 1e-12
-    assert flat.mean_section(ahead, ahead) < 1e-24
+    assert flat.square_metres(ahead, ahead) < 1e-24
     assert "-100 dB against their edges" in flat.described(ahead, ahead)
 
 
