@@ -470,12 +470,11 @@ def costs(
     y = wrapped(z[None] - mean[:, None], ambiguity)
     measured = np.isfinite(y)
     y = np.where(measured, y, 0.0)
-    most = _gates(probability)[measured.sum(axis=-1)]
+    most = gates(probability)[measured.sum(axis=-1)]
     variance = np.fmax(std, STD_FLOOR) ** 2
     own_variance = S[:, None, range(4), range(4)] + variance
-    k, q = np.nonzero(
-        (y**2 <= most[..., None] * own_variance).all(axis=-1)
-    )  # necessary for the gate
+    # necessary for the gate
+    k, q = np.nonzero((y**2 <= most[..., None] * own_variance).all(axis=-1))
     both = measured[k, q, :, None] & measured[k, q, None, :]
     A = np.where(both, S[k] + np.eye(4) * variance[q, None], np.eye(4))
     d2, log_det = mahalanobis(y[k, q], A)
@@ -494,6 +493,6 @@ def mahalanobis(y: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @lru_cache(maxsize=8)
-def _gates(probability: float) -> np.ndarray:
+def gates(probability: float) -> np.ndarray:
     """Return the gates, quantiles of chi-square, for 0 to 4 components (5,)."""
     return 2 * gammaincinv(np.arange(5) / 2, probability)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -21,12 +22,12 @@ from isac_rt.track.filter import (
     costs,
     curvature,
     expected,
+    gates,
     initiate_all,
     measurement_covariance,
     narrowed,
     predict,
     reported,
-    resting,
     update,
 )
 from isac_rt.track.settings import Tracking
@@ -56,20 +57,24 @@ def in_plane(detections: Detections) -> Detections:
     return replace(detections, direction=np.where(unseen, 0.0, detections.direction), std=std)
 
 
-def spread(detections: Detections, size: float) -> np.ndarray:
-    """Return deviations (Q, 4) of detections that lie anywhere on a target of some size [m]."""
+def spread(detections: Detections, size: float, acceleration_std: float, legs: int) -> np.ndarray:
+    """Return deviations (Q, 4) of detections of any part of a target of some size [m], over one leg
+    or two. Parts move: E[v^2] = -E[xa] is the product of the deviations of place and acceleration
+    [m/s^2] against the target at most (Cauchy and Schwarz)."""
     std, of_place = detections.std.copy(), size / np.sqrt(12)
-    std[:, 0] = np.hypot(std[:, 0], of_place)
+    of_parts = of_place, np.sqrt(of_place * acceleration_std)
+    std[:, :2] = np.hypot(std[:, :2], legs * np.array(of_parts))
     std[:, 2:] = np.hypot(std[:, 2:], of_place / detections.range[:, None])
     return std
 
 
-def strongest(rows: Sequence[int], places: np.ndarray, snr: np.ndarray, size: float) -> list[int]:
-    """Return rows of detections without those that are nearer than `size` [m] to a stronger one, by
-    their places (Q, 3)."""
-    out: list[int] = []
-    for q in sorted(rows, key=lambda q: -snr[q]):
-        if not (np.linalg.norm(places[out] - places[q], axis=1) < size).any():
+def strongest(rows: Sequence[int], found: Detections, std: np.ndarray, gate: float) -> list[int]:
+    """Return rows of detections without other parts of the target of a stronger one, which differ
+    in range and direction by less than a gate by their deviations (Q, 4)."""
+    out, z = list[int](), found.measured
+    for q in sorted(rows, key=lambda q: -found.snr[q]):
+        apart = np.nan_to_num((z[out] - z[q]) / np.hypot(std[out], std[q]))[:, [0, 2, 3]]
+        if ((apart**2).sum(axis=1) > gate).all():
             out.append(q)
     return out
 
@@ -266,12 +271,12 @@ class Tracker(Stateful):
         Detections that are a PT's reference are passed over. With a transmitter all are taken as
         bistatic.
         """
-        z, std, size = detections.measured, detections.std, self.settings.target_size_m
+        z, std, s = detections.measured, detections.std, self.settings
         free = [int(q) for q in np.flatnonzero(~detections.is_reference)]
-        if size:
-            sender = None if transmitter is None else transmitter.mean
-            free = strongest(free, resting(z, own, sender)[:, :3], detections.snr, size)
-            std = spread(detections, size)
+        if s.target_size_m:
+            legs = 1 if transmitter is None else 2
+            std = spread(detections, s.target_size_m, s.acceleration_std_mps2, legs)
+            free = strongest(free, detections, std, gates(s.gate_probability)[3])
         cost = self._costs(z, std, own, transmitter)
         hit: dict[int, int] = {}
         for confirmed in (True, False):
@@ -291,21 +296,15 @@ class Tracker(Stateful):
         self._condition(hit, z, std, own, transmitter)
         self.state.tracks = [t for t in self.tracks if not self._dead(t)]
         free = [q for q in free if detections.starts[q]]
-        which, states = initiate_all(
-            z[free],
-            detections.std[free],
-            own,
-            transmitter,
-            acceleration_std=self.settings.acceleration_std_mps2,
-            ambiguity=self.ambiguity,
-        )
+        about: Any = {"acceleration_std": s.acceleration_std_mps2, "ambiguity": self.ambiguity}
+        which, states = initiate_all(z[free], std[free], own, transmitter, **about)
         first: dict[int, int] = {}
         for i, mean, covariance in zip(which.tolist(), *states, strict=True):
             q, state = free[i], Gaussian(mean, covariance)
             track = Track(self.new_id(), state, float(detections.snr[q]), detection=q)
             track.first_id = first.setdefault(q, track.id)
             track.last = self.state.time
-            track.confirmed = self.settings.confirm_hits == 1
+            track.confirmed = s.confirm_hits == 1
             self.tracks.append(track)
 
     def _condition(

@@ -335,7 +335,7 @@ def test_a_street_with_sumos_traffic_has_its_numbers():
     figures = irt.run(scenario, snapshots=0, progress=False).summary["terminals"]
     at, pt = figures["AT"], figures["PT1"]
     assert at["hit_rate"] == pytest.approx(0.75, abs=0.13)
-    assert pt["hit_rate"] == 1 and pt["ser_dpsk"] == pt["ser_delay"] == 0
+    assert pt["hit_rate"] >= 0.9 and pt["ser_dpsk"] == pt["ser_delay"] == 0
     assert max(at["false_tracks_per_frame"], pt["false_tracks_per_frame"]) < 1.5
-    assert at["object_tracks_per_frame"] == pytest.approx(11, abs=4)
-    assert pt["object_tracks_per_frame"] == pytest.approx(7, abs=2)
+    assert at["object_tracks_per_frame"] == pytest.approx(13, abs=4)
+    assert pt["object_tracks_per_frame"] == pytest.approx(9, abs=2)

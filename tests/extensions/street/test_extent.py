@@ -20,6 +20,8 @@ import isac_rt as irt
 from isac_rt.extensions.street.centres import body_axes
 from isac_rt.extensions.street.extent import KINDS, fixed_of, of_several
 from isac_rt.extensions.street.walker import walker_of_flight
+from isac_rt.receive.types import Detections
+from isac_rt.track.tracker import spread
 from isac_rt.world.settings import Extent, Uav
 from isac_rt.world.swarm import Swarm
 
@@ -255,6 +257,7 @@ def test_paths_and_scores_have_the_cross_section_of_the_extent(kind, dbsm):
         assert abs(frame.paths[OWN].gain[0]) == pytest.approx(gain, rel=1e-3)
 
 
+PEDESTRIAN, VEHICLE = ({"extent": {"kind": kind}} for kind in ("pedestrian", "vehicle"))
 SMALL = {"extent": {"kind": "uav", "size_m": (0.4, 0.4, 0.15)}, "rotors": {}}
 
 
@@ -282,6 +285,52 @@ def test_a_target_with_extent_is_one_track(body, place, speed, size):
     assert run.summary["terminals"]["radar"]["false_tracks_per_frame"] == 0
     if size > 5:
         assert tracks_by_frame(irt.run(points, progress=False, snapshots=0).dataset).max() > 2
+
+
+@pytest.mark.parametrize(
+    ("target", "size"),
+    [
+        ({"position_m": (1, 15, 1), "velocity_mps": (0, -1.4, 0)} | PEDESTRIAN, 1.0),
+        ({"position_m": (-3, 20, 1), "velocity_mps": (1.4, -0.2, 0)} | PEDESTRIAN, 1.0),
+        ({"position_m": (1, 20, 3), "velocity_mps": (0, -3, 0), "extent": {"kind": "uav"}}, 2.0),
+        ({"position_m": (-8, 30, 1), "velocity_mps": (8, -6, 0)} | VEHICLE, 6.0),
+    ],
+    ids=["walks up", "walks by", "uav", "vehicle"],
+)
+def test_parts_that_move_start_no_second_track(target, size):
+    """40 frames, three seeds. Planted bugs: exact velocities (half of the frames of who walks up);
+    the stated deviations in `strongest` (a third of the frames of the UAV)."""
+    second = []
+    for seed in (1, 2, 3):
+        s = scene(target, frames=40, chirps=96)
+        tree = s.model_dump(mode="json") | {"tracking": {"target_size_m": size}, "seed": seed}
+        run = irt.run(type(s).model_validate(tree), progress=False, snapshots=0)
+        second.append(tracks_by_frame(run.dataset)[5:] > 1)
+    assert np.mean(second) < 0.06
+
+
+def test_parts_deviate_by_place_and_swing():
+    """Of a point that swings through a target: E[v^2] = E[x^2]^1/2 E[a^2]^1/2, over two legs twice
+    as much. Planted bugs: `size` for its deviation; one leg for two."""
+    size, a = 0.9, 2.5
+    t = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    x_rms = size / np.sqrt(12)
+    omega = np.sqrt(a / x_rms)
+    swing = np.sqrt(2) * x_rms * omega * np.cos(t)
+    one = Detections(
+        range=np.array([4.0]),
+        velocity=np.zeros(1),
+        direction=np.zeros((1, 2)),
+        snr=np.ones(1),
+        std=np.array([[0.3, 0.4, 0.01, 0.02]]),
+        is_reference=np.zeros(1, bool),
+        starts=np.ones(1, bool),
+    )
+    for legs in (1, 2):
+        found = spread(one, size, a, legs)[0]
+        assert found[0] == pytest.approx(np.hypot(0.3, legs * x_rms))
+        assert found[1] == pytest.approx(np.hypot(0.4, legs * swing.std()))
+        assert found[2:] == pytest.approx(np.hypot([0.01, 0.02], x_rms / 4))
 
 
 def tracks_by_frame(dataset):
