@@ -390,13 +390,13 @@ class Box(Node):
     convex solid in its place."""
 
     size_m: tuple[Side, Side, Side] | None = None
-    """Width, length and height [m], along right, ahead and up of the UAV's body."""
+    """Width, length and height [m], along right, ahead and up of the body. By default a mesh's."""
     corners_m: tuple[Vector, ...] | None = None
-    """Corners of a convex solid in place of `size_m`: to the right, ahead, up of the UAV's position
-    [m]."""
+    """Corners of a convex solid: to the right, ahead, up of the UAV's position [m]. null, the
+    default: those of a cuboid."""
     file: str | None = None
-    """Closed mesh in place of `size_m`, in metres, y ahead, z up (glTF: y up), its middle at the
-    UAV's position: PLY, OBJ, STL, glTF or GLB. Its convex hull is taken."""
+    """Closed mesh in metres, y ahead, z up (glTF: y up), its middle at the UAV's position: PLY,
+    OBJ, STL, glTF or GLB. Its convex hull is taken, scaled to `size_m` where that is stated."""
     material: str = "metal"
     """Material of all faces, by its name in the table of materials or in `city.materials`. By
     default metal, as of a car."""
@@ -404,9 +404,9 @@ class Box(Node):
     def problems(self) -> Iterator[Problem]:
         if self.file is not None:
             yield Problem((("file",),), "is read by isac_rt.load, which was not used; state size_m")
-        elif (self.size_m is None) == (self.corners_m is None):
-            text = "a box has one of size_m, corners_m and file; state one"
-            yield Problem((("size_m",), ("corners_m",)), text)
+        elif self.size_m is None and self.corners_m is None:
+            text = "a box needs its size_m, or the file of a mesh"
+            yield Problem((("size_m",), ("file",)), text)
 
 
 class Waypoint(Node):

@@ -100,7 +100,7 @@ def _vehicle(
     else:
         box, extent = stated.get("box") or {}, stated.get("extent") or {}
         size = cars.sizes.get(name) or box.get("size_m") or CAR_M
-        if box and not box.keys() & {"file", "corners_m"}:
+        if box:
             out["box"] = {**box, "size_m": list(size)}
         if extent.get("kind") == "vehicle":
             out["extent"] = {"size_m": list(size), **extent}

@@ -18,8 +18,9 @@ FLAT = 1e-4
 MOST_FACETS = 200
 """Facets of a solid: each is tried as a mirror between all terminals and UAVs."""
 SMALLEST_M = 0.01
-CORNERS = np.array(list(itertools.product((-1, 1), repeat=3)))
-"""Of a box, in half its sides."""
+CUBE = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+"""Corners of a cube of 1 m."""
+TINY = np.finfo(float).tiny
 
 
 class Solid(NamedTuple):
@@ -48,9 +49,10 @@ class Solid(NamedTuple):
 
 def solid_of_box(name: str, box: Box) -> Solid:
     """Return the solid that the settings of a UAV's box state."""
-    size, corners = box.size_m, box.corners_m
+    corners = CUBE if box.corners_m is None else np.array(box.corners_m)
+    scale = 1.0 if box.size_m is None else box.size_m / np.maximum(np.ptp(corners, axis=0), TINY)
     try:
-        return solid_of(np.array(corners) if size is None else CORNERS * size / 2)
+        return solid_of(corners * scale)
     except CityError as problem:
         raise CityError(f"swarm.{name}.box.corners_m: {problem}") from None
 

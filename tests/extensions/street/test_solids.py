@@ -13,7 +13,7 @@ from truths.cars import LINK, OWN, WAVELENGTH, box_of, mirrors, paths_at, stage,
 
 import isac_rt as irt
 from isac_rt.document import ScenarioError
-from isac_rt.extensions.street.solid import corners_of_mesh, solid_of
+from isac_rt.extensions.street.solid import corners_of_mesh, solid_of, solid_of_box
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.runtime import UserError
@@ -187,14 +187,19 @@ def empty(at):
     return "car.obj"
 
 
-def test_corners_in_a_plane_and_two_shapes_are_refused():
-    """Planted bug: `==` for `is None` twice in `Box.problems`."""
+def test_a_mesh_is_scaled_to_the_size_beside_it():
+    """As vehicles of a traffic file have sizes of their own. Planted bug: the length for all."""
+    box = Box(corners_m=WEDGE.tolist(), size_m=(1.0, 4.0, 3.0))
+    assert solid_of_box("car", box).corners == pytest.approx(WEDGE * [0.5, 2.0, 1.5])
+
+
+def test_corners_in_a_plane_and_boxes_of_no_size_are_refused():
+    """Planted bug: no name in the message."""
     flat = "swarm.car.box={corners_m: [[0,0,0],[1,0,0],[0,1,0],[1,1,0]]}"
     with pytest.raises(UserError, match=r"swarm.car.box.*is flat"):
         irt.prepare(irt.load(SCENES / "street_traffic.yaml", [flat]))
-    for box in ("{}", "{size_m: [1, 1, 1], corners_m: [[0,0,0],[1,0,0],[0,1,0],[0,0,1]]}"):
-        with pytest.raises(ScenarioError, match=r"car.box.*one of size_m, corners_m and file"):
-            irt.load(SCENES / "street_traffic.yaml", [f"swarm.car.box={box}"])
+    with pytest.raises(ScenarioError, match=r"car.box.*needs its size_m, or the file of a mesh"):
+        irt.load(SCENES / "street_traffic.yaml", ["swarm.car.box={material: glass}"])
 
 
 def test_a_ball_keeps_its_facets():
