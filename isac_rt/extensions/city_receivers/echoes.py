@@ -56,8 +56,7 @@ class Wave:
     sent : (L_tx,) complex amplitudes of a sample
     late : (L_tx,) delays of the transmit antennas [cells], fitted of a strong one
     reach : range rows on each side in which it is taken out
-    received : (L_rx,) complex, the receivers as a strong one shows them, which may differ from the
-        steering; None: of a weak one
+    strong : whether the delays of the transmit antennas are fitted
     spread : (4,) deviations of delay, rate and cosines over those of the wave alone
     """
 
@@ -67,7 +66,7 @@ class Wave:
     sent: np.ndarray
     late: np.ndarray
     reach: int
-    received: np.ndarray | None = None
+    strong: bool = False
     spread: np.ndarray = field(default_factory=lambda: np.ones(4))
 
 
@@ -78,8 +77,7 @@ class _Tangents(NamedTuple):
     ----------
     by_chirp : (N, M rows P) complex, of each parameter
     receiver : (N,) which of the functions of the receiver goes with each
-    by_receiver : (3, L_rx) the steering and its derivatives by both cosines, or (1, L_rx) what a
-        strong wave shows
+    by_receiver : (3, L_rx) the steering and its derivatives by both cosines
     """
 
     by_chirp: np.ndarray
@@ -107,21 +105,16 @@ class Waves:
 
     def wave(self, e: Estimate, cosines: np.ndarray, power: float, *, strong: bool) -> Wave:
         """Return the wave from a direction in the channels of an estimate, whose peak has such a
-        power over the noise; of a `strong` one the part of the channels that is of rank one."""
-        received, reach = None, lobes_over(power / LEAST)
-        if strong:
-            left, values, right = np.linalg.svd(e.channels, full_matrices=False)
-            size = np.sqrt(right.shape[1])
-            sent, received = left[:, 0] * values[0] / size, right[0] * size
-        else:
-            a = self._steering(e.delay, cosines)[0][0]
-            sent = e.channels @ a.conj() / a.size
+        power over the noise."""
+        a = self._steering(e.delay, cosines)[0][0]
+        sent, reach = e.channels @ a.conj() / a.size, lobes_over(power / LEAST)
         late = np.zeros(sent.size)
-        return Wave(e.delay, e.delay_rate, np.array(cosines), sent, late, reach, received)
+        return Wave(e.delay, e.delay_rate, np.array(cosines), sent, late, reach, strong)
 
     def estimate(self, wave: Wave) -> Estimate:
         """Return a wave as an estimate."""
-        return Estimate(wave.delay, wave.rate, np.outer(wave.sent, self._responses(wave)[0][0]))
+        a = self._steering(wave.delay, wave.cosines)[0][0]
+        return Estimate(wave.delay, wave.rate, np.outer(wave.sent, a))
 
     def place(self, wave: Wave) -> np.ndarray:
         """Return beat [cells] and Doppler [bins] of a wave at mid-frame."""
@@ -159,7 +152,7 @@ class Waves:
         number = connected_components(near, directed=False)[1]
         for group in np.unique(number[len(self.waves) - len(waves) :]):
             mine = [self.waves[k] for k in np.flatnonzero(number == group)]
-            if len(mine) > 1 or mine[0].received is not None:
+            if len(mine) > 1 or mine[0].strong:
                 self._fit(mine)
 
     def put_back(self, wave: Wave) -> None:
@@ -181,11 +174,6 @@ class Waves:
         a = np.exp(turn * late)
         return np.stack([a, *(turn * self._beam[:, None] * slopes * a)]), late / w.delay_step
 
-    def _responses(self, wave: Wave) -> tuple[np.ndarray, np.ndarray]:
-        """Return `_steering` of a wave; of a strong one what the receivers show alone."""
-        functions, late = self._steering(wave.delay, wave.cosines)
-        return (functions if wave.received is None else wave.received[None]), late
-
     def _cycles(self, wave: Wave) -> np.ndarray:
         w = self._known.waveform
         return w.phase(wave.delay + wave.rate * self._known.times, w.window_middle)
@@ -193,7 +181,7 @@ class Waves:
     def _add(self, wave: Wave, sign: float) -> None:
         """Add a wave times `sign` to the spectra."""
         w, rows = self._known.waveform, self._rows(wave)
-        at_receivers, late = self._responses(wave)
+        at_receivers, late = self._steering(wave.delay, wave.cosines)
         beat = w.beat_cells(wave.delay, wave.rate, self._known.times)
         phasor = np.exp(2j * np.pi * self._cycles(wave))
         window = float(w.window_length), float(w.num_samples)
@@ -247,14 +235,13 @@ class Waves:
         sent, by_antenna = wave.sent[self._schedule][:, None], [m[:, None] for m in known.sent_by]
         later = sent * phasor * (ahead - behind) / (2 * STEP)
         turn = 2j * np.pi * rate_bin(w) * w.effective_carrier * times[:, None]
-        weak = wave.received is None
         parts = [unit * mine * factor for mine in by_antenna for factor in (1, 1j)]
-        parts += [later] if weak else [later * mine for mine in by_antenna]
+        parts += [later * mine for mine in by_antenna] if wave.strong else [later]
         parts += [turn * sent * unit + faster[:, None] * later]
-        receiver = np.append(np.zeros(len(parts), int), 1 + self._axes[: None if weak else 0])
+        receiver = np.append(np.zeros(len(parts), int), 1 + self._axes)
         parts += [sent * unit] * (receiver.size - len(parts))
         by_chirp = np.array(parts).reshape(len(parts), -1)
-        return _Tangents(by_chirp, receiver, self._responses(wave)[0])
+        return _Tangents(by_chirp, receiver, self._steering(wave.delay, wave.cosines)[0])
 
     def _solved(
         self, tangents: list[_Tangents], left: np.ndarray
@@ -293,15 +280,14 @@ class Waves:
         w, size, before = self._known.waveform, wave.sent.size, self._cycles(wave)
         sent = wave.sent + move[: 2 * size : 2] + 1j * move[1 : 2 * size : 2]
         rest = np.clip(move[2 * size :], -LARGEST, LARGEST)
-        late, rest = np.split(rest, [1 if wave.received is None else size])
+        late, rest = np.split(rest, [size if wave.strong else 1])
         late = wave.late + late
         wave.late = late - late.mean()
         wave.delay += float(late.mean()) * w.delay_step
         wave.rate += float(rest[0]) * rate_bin(w)
-        if wave.received is None:
-            u = wave.cosines.copy()
-            u[self._axes] += rest[1:] * self._beam[self._axes]
-            wave.cosines = u / max(float(np.linalg.norm(u)), 1.0)
+        u = wave.cosines.copy()
+        u[self._axes] += rest[1:] * self._beam[self._axes]
+        wave.cosines = u / max(float(np.linalg.norm(u)), 1.0)
         turned = np.exp(2j * np.pi * (self._cycles(wave) - before))
         by_antenna = np.array([turned[mine].mean() for mine in self._known.sent_by])
         wave.sent = sent * np.exp(-1j * np.angle(by_antenna))
