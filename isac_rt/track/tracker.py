@@ -16,6 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from isac_rt.plain import Stateful
 from isac_rt.receive.types import Detections, Prediction
+from isac_rt.track import existence
 from isac_rt.track.filter import (
     Ambiguity,
     Gaussian,
@@ -37,6 +38,8 @@ SURE_HITS = 2
 """With `tracking.initiation: unexplained` a track is confirmed if so many of its detections could
 have started it: others pass a lower threshold, which strong clutter passes again and again. At an
 active terminal these are enough, for chance shows none of them twice."""
+CLEAR_M = 0.5
+"""No two UAVs are nearer to each other, and none is to a wall [m]: their arms are as long."""
 ROUNDING = 1e-9
 """Of sums of frame intervals [s]."""
 
@@ -104,6 +107,9 @@ class Track:
     recent : whether each of the latest frames held a detection, newest last, the first detection
         included
     missed : frames since the last detection
+    hits : detections so far
+    odds : logarithm of the odds that it follows a target (`isac_rt.track.existence`); infinite
+        where tracks count on their hits alone
     confirmed : M hits in N frames were reached, `SURE_HITS` of them sure
     detection : row among the frame's detections that updated it, -1: none
     last : time of the last detection [s]
@@ -118,11 +124,18 @@ class Track:
     age: int = 0
     recent: list[bool] = field(default_factory=lambda: [True])
     missed: int = 0
+    hits: int = 1
+    odds: float = np.inf
     confirmed: bool = False
     detection: int = -1
     last: float = -np.inf
     sure: int = 1
     first_id: int = -1
+
+    @property
+    def credible(self) -> bool:
+        """Whether it is reported as a target: confirmed, and more probably one than not."""
+        return self.confirmed and self.odds > 0
 
     @classmethod
     def of_state(
@@ -150,7 +163,7 @@ class TrackSet:
     direction : (K, 2) u_x, u_z
     std : (K, 4) standard deviations of range, velocity, u_x, u_z
     age : (K,) int, frames since the first detection
-    confirmed, is_reference : (K,) bool; the reference is a PT's track of its AT
+    confirmed, is_reference : (K,) bool; `Track.credible`; the reference is a PT's track of its AT
     detection : (K,) int, row among the frame's detections that updated it, -1: none
     snr : (K,) of the last detection, infinite where others report a body
     """
@@ -204,7 +217,7 @@ def track_set(tracks: Sequence[Track], own: Pose, reference: Track | None = None
         direction=z[:, 2:],
         std=std,
         age=np.array([t.age for t in everyone], np.int64),
-        confirmed=np.array([t.confirmed for t in everyone], bool),
+        confirmed=np.array([t.credible for t in everyone], bool),
         is_reference=is_reference,
         detection=np.array([t.detection for t in everyone], np.int64),
         snr=np.array([t.snr for t in everyone], float),
@@ -232,6 +245,7 @@ class Tracker(Stateful):
 
     def __init__(self, settings: Tracking, ambiguity: Ambiguity) -> None:
         self.settings = settings
+        self.by_odds = settings.initiation == "unexplained"
         self.ambiguity = ambiguity
         self.state = Followed()
 
@@ -294,7 +308,7 @@ class Tracker(Stateful):
                 track.last = self.state.time
         self._one_reading_each()
         self._condition(hit, z, std, own, transmitter)
-        self.state.tracks = [t for t in self.tracks if not self._dead(t)]
+        self.state.tracks = [t for t in self._joined() if not self._dead(t)]
         free = [q for q in free if detections.starts[q]]
         about: Any = {"acceleration_std": s.acceleration_std_mps2, "ambiguity": self.ambiguity}
         which, states = initiate_all(z[free], std[free], own, transmitter, **about)
@@ -305,6 +319,7 @@ class Tracker(Stateful):
             track.first_id = first.setdefault(q, track.id)
             track.last = self.state.time
             track.confirmed = s.confirm_hits == 1
+            track.odds = existence.BIRTH if self.by_odds else np.inf
             self.tracks.append(track)
 
     def _condition(
@@ -374,13 +389,37 @@ class Tracker(Stateful):
                 most, own = hits[track.first_id], sum(track.recent)
                 track.confirmed &= sum(count >= own for count in most) == 1
 
+    def _joined(self) -> list[Track]:
+        """Return the tracks, of confirmed ones in one place the oldest alone, as the one of them
+        that was found last has it."""
+        out: list[Track] = []
+        for track in self.tracks:
+            place = track.state.mean[:3]
+            near = (
+                other
+                for other in out
+                if self.by_odds
+                and track.confirmed
+                and other.confirmed
+                and np.linalg.norm(other.state.mean[:3] - place) < CLEAR_M
+            )
+            older = next(near, None)
+            if older is None:
+                out.append(track)
+            elif track.missed < older.missed:
+                vars(older).update(vars(track) | {"id": older.id, "age": older.age})
+        return out
+
     def _live(self, track: Track, hit: bool, active: bool) -> None:
         s = self.settings
+        if self.by_odds:
+            track.odds = existence.updated(track.odds, hit, track.hits, track.age + 1)
         track.age += 1
+        track.hits += hit
         track.missed = 0 if hit else track.missed + 1
         track.recent = [*track.recent, hit][-s.confirm_window :]
         enough = sum(track.recent) >= s.confirm_hits
-        if s.initiation == "unexplained":
+        if self.by_odds:
             sure = track.sure >= min(SURE_HITS, s.confirm_hits)
             enough = sure and (enough or active)
         track.confirmed = track.confirmed or enough

@@ -20,7 +20,7 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
 from isac_rt.track.filter import INITIAL_SPEED_STD, Ambiguity, mahalanobis
 from isac_rt.track.parts import Ownship, TrackRule
-from isac_rt.track.tracker import Track, Tracker, assign
+from isac_rt.track.tracker import CLEAR_M, Track, Tracker, assign
 from isac_rt.world.swarm import Pose
 
 STILL_MPS = 0.5
@@ -40,9 +40,6 @@ SURFACE = 16
 """So many spots beside a track are a surface, whether found again or not: a dozen UAVs are less."""
 FOUND_AGAIN = 0.5
 """Share of the frames since its first one in which a UAV is found."""
-CLEAR_M = 0.5
-"""No UAV flies nearer to a face than this [m]: its arms are as long. What is nearer, by two
-deviations, is an echo of something else over the wall."""
 STANDS_OUT = 10.0
 """An echo weaker than another by more than this factor is not of the same surface."""
 
@@ -183,7 +180,7 @@ class StaticClutter(TrackRule):
         confirmed one that was found in each of the latest frames is no passing spot."""
         place = track.state.mean[:3]
         if rests(track):
-            again = track.confirmed and track.age >= len(track.recent) and all(track.recent)
+            again = track.confirmed and all(track.recent)
             return not again and bool(self.crowded(place[None], np.array([track.snr]))[0])
         spread = float(np.sqrt(np.linalg.eigvalsh(track.state.covariance[:3, :3])[-1]))
         return self._walls is not None and self._walls.within(place, CLEAR_M - 2 * spread)
