@@ -55,7 +55,7 @@ def test_odds_are_those_of_a_probability_of_which_nothing_is_known(misses):
 def test_a_track_is_reported_while_it_is_a_target_more_probably_than_not():
     """Two detections confirm a track of an active terminal; a miss makes it an artefact more
     probably, the next detection a target again. Without a city only confirmation counts. Planted
-    bugs: confirmation alone is reported; odds that do not fall."""
+    bugs: confirmation alone is reported; odds that do not fall; a record with the frame itself."""
     for settings, reported in (
         (Tracking(initiation="unexplained"), [False, True, False, True, True]),
         (Tracking(confirm_hits=2), [False, True, True, True, True]),
@@ -66,6 +66,10 @@ def test_a_track_is_reported_while_it_is_a_target_more_probably_than_not():
             tracker.update(d, OWN)
             said.append(bool(tracker.snapshot(OWN).confirmed[0]))
         assert said == reported
+        odds = existence.BIRTH + betaln(5, 2) - betaln(2, 1)
+        odds -= 3 * np.log(existence.RECURS) + np.log(1 - existence.RECURS)
+        alone = tracker.tracks[0].odds
+        assert alone == pytest.approx(odds) if tracker.by_odds else alone == np.inf
 
 
 @pytest.mark.parametrize(("apart", "left"), [(0.3, 1), (0.7, 2)])
