@@ -134,7 +134,7 @@ class Track:
 
     @property
     def credible(self) -> bool:
-        """Whether it is reported as a target: confirmed, and more probably one than not."""
+        """True where it is reported: confirmed, and a target more probably than not."""
         return self.confirmed and self.odds > 0
 
     @classmethod
@@ -394,20 +394,13 @@ class Tracker(Stateful):
         that was found last has it."""
         out: list[Track] = []
         for track in self.tracks:
-            place = track.state.mean[:3]
-            near = (
-                other
-                for other in out
-                if self.by_odds
-                and track.confirmed
-                and other.confirmed
-                and np.linalg.norm(other.state.mean[:3] - place) < CLEAR_M
-            )
-            older = next(near, None)
-            if older is None:
+            places = [t.state.mean[:3] for t in out]
+            off = np.linalg.norm(np.reshape(places, (-1, 3)) - track.state.mean[:3], axis=1)
+            near = [t for t, d in zip(out, off, strict=True) if t.confirmed and d < CLEAR_M]
+            if not (near and track.confirmed and self.by_odds):
                 out.append(track)
-            elif track.missed < older.missed:
-                vars(older).update(vars(track) | {"id": older.id, "age": older.age})
+            elif track.missed < near[0].missed:
+                vars(near[0]).update(vars(track) | {"id": near[0].id, "age": near[0].age})
         return out
 
     def _live(self, track: Track, hit: bool, active: bool) -> None:
