@@ -336,8 +336,9 @@ class PassiveReceiver:
         out = Reception.undecoded(cube.waveform, detections, kept_maps, sensed.sparse)
         if reference is not None:
             level = _power(reference)
-            out = replace(out, line_of_sight=True, reference_power=level)
-            out = replace(out, path_channels=sensed.path_channels, elements=sensed.elements)
+            out = replace(
+                out, line_of_sight=True, reference_power=level, path_channels=sensed.path_channels
+            )
         if self.refiner is None:
             return out
         detections, power = self.refiner(moments, detections)

@@ -53,8 +53,8 @@ MAX_PATHS = 24
 @dataclass(frozen=True)
 class Sensed:
     """Detections of a frame with their estimates, strongest first, the map that they came from and
-    its background (`CfarRule.detect`). `sparse`, `correction`, `path_channels`, `neighbours`,
-    `elements`: see `Reception`."""
+    its background (`CfarRule.detect`). `sparse`, `correction`, `path_channels`, `neighbours`: see
+    `Reception`."""
 
     estimates: list[Estimate]
     detections: Detections
@@ -64,7 +64,6 @@ class Sensed:
     correction: Correction | None = None
     path_channels: tuple[PathChannels, ...] = ()
     neighbours: Neighbours | None = None
-    elements: np.ndarray | None = None
 
 
 class Detector(Protocol):

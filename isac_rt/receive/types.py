@@ -227,8 +227,6 @@ class Reception:
         `receivers.self_calibration` is none
     neighbours : what clutter shows of the channels; None where nobody asks, or the detector does
         not know the mesh
-    elements : (L_rx,) complex, sum over the frames so far of how strong paths show the receivers,
-        over their steering; None where the detector does not ask
     """
 
     detections: Detections
@@ -250,7 +248,6 @@ class Reception:
     neighbours: Neighbours | None = None
     placed: bool = True
     intact: bool = True
-    elements: np.ndarray | None = None
 
     @property
     def is_read(self) -> bool:
@@ -388,11 +385,9 @@ class Hints:
     Attributes
     ----------
     clutter : what its city returns; None: unknown
-    elements : `Reception.elements` of the frame before
     """
 
     clutter: ExpectedClutter | None = None
-    elements: np.ndarray | None = None
 
 
 NO_HINTS = Hints()

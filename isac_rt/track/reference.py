@@ -86,7 +86,6 @@ class Followed:
     slips_repaired : times that the range was moved by whole cells while data flowed
     ends : symbols at and beyond the alphabet's ends, by frame, the newest last
     report : the transmitter as its data reported it last; None: they never did
-    elements : `Reception.elements` of the last frame that showed the line of sight
     """
 
     track: Track | None = None
@@ -96,7 +95,6 @@ class Followed:
     slips_repaired: int = 0
     ends: list[np.ndarray] = field(default_factory=list)
     report: Track | None = None
-    elements: np.ndarray | None = None
 
 
 class Reference(Stateful):
@@ -178,7 +176,6 @@ class Reference(Stateful):
                 self.track.missed += 1
                 self.state.status = TerminalState.LOST
             return
-        self.state.elements = reception.elements
         d = in_plane(reception.detections)
         q = int(np.flatnonzero(d.is_reference)[0])
         z = d.measured[q]

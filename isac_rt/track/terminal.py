@@ -256,7 +256,7 @@ class PassiveTerminal(Stateful):
         self.reference.predict(time)
         self.tracker.predict(time)
         own = self._own(Ownship(own_pose, time, reported_poses, reports), sender)
-        self._hints = Hints(own.clutter, self.reference.state.elements)
+        self._hints = Hints(own.clutter)
         self._hand_over(own)
         reception = self._read(cube, own, modulated, maps)
         refused = reception.line_of_sight and not self.reference.is_plausible(

@@ -62,9 +62,6 @@ ROUNDS = 4
 """Most searches, each of what the waves found before leave."""
 FARTHEST = 1.5
 """Cells or bins that a wave may move away from where it was found."""
-BESIDE = 1e-3
-"""Power of echoes beside a strong path in its cell, over that path: a UAV of -10 dBsm 3 m before a
-terminal returns so much."""
 STD_CELLS = 0.1
 """Smallest deviation of range and velocity, in cells, of what shares its cell with others."""
 
@@ -80,30 +77,22 @@ class BeamSearch(BySchedule):
         _, level = self.rule(known).detect(strong.whole)
         test = _Test.of(self.settings, known, strong.power, hints.clutter)
         found = Waves(spectra.copy(), known, test.noise / window_gain(known), test.search.beam)
-        towards = [self._direction(e, test) for e in strong.paths]
-        elements = hints.elements
-        if strong.paths:
-            k = int(strong.snr.argmax())
-            shown = found.shown(strong.paths[k], towards[k])
-            elements = shown if elements is None else elements + shown
-            found.elements = _believed(elements / elements.mean())
-        each = zip(strong.paths, towards, strong.snr.tolist(), strict=True)
-        found.take_out([found.wave(*path, strong=True) for path in each])
+        each = zip(strong.paths, strong.snr.tolist(), strict=True)
+        found.take_out([self._strong(found, *path, test) for path in each])
         found.changed_rows()
         weak = self._weak(found, test)
         estimates = [*strong.paths, *(found.estimate(f.wave) for f in weak)]
         joined = [describe(strong.paths, strong.snr, known), self._described(weak, test)]
-        d = Detections.joined(joined)
-        return Sensed(estimates, d, strong.whole, level, elements=elements)
+        return Sensed(estimates, Detections.joined(joined), strong.whole, level)
 
-    def _direction(self, estimate: Estimate, test: _Test) -> np.ndarray:
-        """Return the direction (2,) of a path that stands out."""
+    def _strong(self, found: Waves, estimate: Estimate, power: float, test: _Test) -> Wave:
+        """Return the wave of a path that stands out by such a power over the noise."""
         cosines = np.array(direction_cosines(estimate, test.known))
         cosines[test.search.beam == 0] = 0.0
         if np.isnan(cosines).any():  # several waves, which look like one from nowhere
             channels = estimate.channels.astype(np.complex64)[:, :, None]
             cosines = search_plain(channels, test.search, 1.0, 0.0).cosines[0]
-        return cosines
+        return found.wave(estimate, cosines, power, strong=True)
 
     def _weak(self, found: Waves, test: _Test) -> list[_Found]:
         """Return the waves that are found in what those before leave, and take them out."""
@@ -163,14 +152,6 @@ class BeamSearch(BySchedule):
             is_reference=np.zeros(len(weak), bool),
             starts=statistic > test.limits[1],
         )
-
-
-def _believed(elements: np.ndarray) -> np.ndarray:
-    """Return responses (L_rx,) that strong paths show, 1 in the mean, drawn to 1 as far as echoes
-    beside the paths explain them: the posterior mean of Gaussian deviations."""
-    off = elements - 1
-    power = float(np.mean(np.abs(off) ** 2))
-    return np.asarray(1 + off * power / (power + BESIDE))
 
 
 class _Found(NamedTuple):

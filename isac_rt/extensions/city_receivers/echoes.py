@@ -93,27 +93,15 @@ class Waves:
     left : (M, L_rx, rows, P) cleaned spectra, from which waves are taken in place
     noise : mean power of a sample of the spectra
     beam : (2,) resolution of u_x and u_z, 0 on an axis that the receivers do not observe
-
-    Attributes
-    ----------
-    elements : (L_rx,) response of the receivers over their steering, 1 in the mean
     """
 
     def __init__(self, left: np.ndarray, known: Known, noise: float, beam: np.ndarray) -> None:
         self.waves: list[Wave] = []
-        self.elements = np.ones(known.antennas.num_rx, complex)
         self.left, self._changed = left, np.zeros(left.shape[2], bool)
         self._known, self._noise, self._beam = known, noise, beam
         self._axes = np.flatnonzero(beam > 0)
         self._schedule = np.array(known.schedule, order="C")
         self._weight = np.sqrt(slow_window(known.waveform)).astype(float)
-
-    def shown(self, e: Estimate, cosines: np.ndarray) -> np.ndarray:
-        """Return how a path from a direction shows the receivers over their steering: the first
-        singular vector of its channels (L_rx,), 1 in the mean."""
-        seen = np.linalg.svd(e.channels, full_matrices=False)[2][0]
-        over = seen / self._steering(e.delay, cosines)[0][0]
-        return np.asarray(over / over.mean())
 
     def wave(self, e: Estimate, cosines: np.ndarray, power: float, *, strong: bool) -> Wave:
         """Return the wave from a direction in the channels of an estimate, whose peak has such a
@@ -183,7 +171,7 @@ class Waves:
         known, w = self._known, self._known.waveform
         late, slopes = element_delays(known.antennas.rx_positions, cosines, known.radius(delay))
         turn = 2j * np.pi * w.effective_carrier
-        a = np.exp(turn * late) * self.elements
+        a = np.exp(turn * late)
         return np.stack([a, *(turn * self._beam[:, None] * slopes * a)]), late / w.delay_step
 
     def _cycles(self, wave: Wave) -> np.ndarray:
