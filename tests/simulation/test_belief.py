@@ -135,4 +135,5 @@ def test_a_terminal_does_not_believe_its_mesh_against_the_samples(monkeypatch):
 
     assert false() < 2
     monkeypatch.setattr(standing, "CROWD", 10**9)
+    monkeypatch.setattr(standing, "SURFACE", 10**9)
     assert false() > 10

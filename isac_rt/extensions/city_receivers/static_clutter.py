@@ -36,6 +36,8 @@ STANDS_ODDS = 10.0
 it flies as UAVs do. What is not known of its velocity says nothing."""
 CROWD = 3
 """So many spots beside it that were not found again make an echo part of a surface."""
+SURFACE = 16
+"""So many spots beside a track are a surface, whether found again or not: a dozen UAVs are less."""
 FOUND_AGAIN = 0.5
 """Share of the frames since its first one in which a UAV is found."""
 STANDS_OUT = 10.0
@@ -88,7 +90,12 @@ class StaticClutter(TrackRule):
     def prune(self, tracker: Tracker, own: Ownship) -> None:
         """End the tracks that are static within a crowd, and those, not confirmed before, that
         an echo of one carries on: from beyond the view and along a wall they seem
-        to move."""
+        to move. Few hits confirm no track beside a surface: chance carries it from spot to spot."""
+        for track in tracker.tracks:
+            few = sum(track.recent) < tracker.settings.confirm_window
+            if track.confirmed and few and track.id in own.tentative:
+                beside = self._beside(track.state.mean[None, :3])
+                track.confirmed = int(beside.sum()) < SURFACE
         fed = {t.id for t in tracker.tracks if t.detection >= 0 and self._crowd[t.detection]}
         still = {t.id for t in tracker.tracks if self.holds(t)}
         tracker.drop(still | (fed & own.tentative))
