@@ -242,7 +242,7 @@ MAX_LINES = {
     "propagation": 4789,
     "signal": 837,
     "receive": 6090,
-    "track": 2042,
+    "track": 2041,
     "scenario": 2213,
     "results": 3745,
     "simulation": 3779,

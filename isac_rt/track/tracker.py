@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import dist
 from typing import Any
 
 import numpy as np
@@ -42,8 +43,6 @@ CLEAR_M = 0.5
 """No two UAVs are nearer to each other, and none is to a wall [m]: their arms are as long."""
 ROUNDING = 1e-9
 """Of sums of frame intervals [s]."""
-
-
 FLAT_STD = 0.1
 """Standard deviation of the direction cosine that is taken for 0 where an array does not observe
 an axis: UAVs fly within some six degrees of the array's plane."""
@@ -394,10 +393,10 @@ class Tracker(Stateful):
         that was found last has it."""
         out: list[Track] = []
         for track in self.tracks:
-            places = [t.state.mean[:3] for t in out]
-            off = np.linalg.norm(np.reshape(places, (-1, 3)) - track.state.mean[:3], axis=1)
-            near = [t for t, d in zip(out, off, strict=True) if t.confirmed and d < CLEAR_M]
-            if not (near and track.confirmed and self.by_odds):
+            joins, place = self.by_odds and track.confirmed, track.state.mean[:3]
+            older = [t for t in out if joins and t.confirmed]
+            near = [t for t in older if dist(t.state.mean[:3], place) < CLEAR_M]
+            if not near:
                 out.append(track)
             elif track.missed < near[0].missed:
                 vars(near[0]).update(vars(track) | {"id": near[0].id, "age": near[0].age})
