@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from isac_rt.extensions.city_receivers.standard import active_terminal, passive_terminal
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload
@@ -22,6 +21,7 @@ from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import Reception
 from isac_rt.track.settings import Tracking
+from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
 from isac_rt.track.tracker import TrackSet
 from isac_rt.world.swarm import Pose
 
@@ -85,8 +85,8 @@ def replay(path: Path | str) -> dict[str, Any]:
         Receivers.model_validate(public["receivers"]),
         Tracking.model_validate(public["tracking"]),
     )
-    active = active_terminal(*known)
-    passive = passive_terminal(*known, public["dpsk_order"], public["transmit_amplitude"])
+    active = ActiveTerminal(*known)
+    passive = PassiveTerminal(*known, public["dpsk_order"], public["transmit_amplitude"])
     out: dict[str, np.ndarray] = {}
     for i in range(sum(name.endswith("/samples") for name in data)):
         start, time = data[f"{i}/times"].tolist()

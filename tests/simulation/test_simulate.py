@@ -15,11 +15,11 @@ from captures import Step, flat, save_capture
 from threadpoolctl import threadpool_limits
 
 from isac_rt import runtime
-from isac_rt.extensions.city_receivers.standard import passive_terminal
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.scenario.file import load
 from isac_rt.simulation import simulate
 from isac_rt.simulation.setup import prepare
+from isac_rt.track.terminal import PassiveTerminal
 
 SCENES = Path(__file__).parents[2] / "scenes"
 FRAMES = {"frames": 6}
@@ -62,7 +62,7 @@ def test_receivers_use_no_truth(tmp_path):
         SCENES / "paper_swarm_consistent.yaml", ["modulation.acquisition_frames=1"], frames=3
     )
     setup = prepare(scenario)
-    live = passive_terminal(
+    live = PassiveTerminal(
         setup.waveform, setup.antennas, scenario.receivers, scenario.tracking, 8, 1.0
     )
     steps, expected = [], {}

@@ -12,7 +12,6 @@ import pytest
 from oracles import slopes, what_is_measured
 from receiver_cubes import ANTENNAS
 
-from isac_rt.extensions.city_receivers.standard import active_terminal, passive_terminal
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.settings import Receivers
@@ -20,7 +19,7 @@ from isac_rt.receive.types import Correction, Detections, ExpectedClutter, Recep
 from isac_rt.track.filter import Gaussian
 from isac_rt.track.reference import Followed, TerminalState, slip_cells
 from isac_rt.track.settings import Tracking
-from isac_rt.track.terminal import PassiveTerminal
+from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
 from isac_rt.track.tracker import Track
 from isac_rt.world.swarm import Pose
 
@@ -95,7 +94,7 @@ class Told:
 def passive(answers=(), state: Gaussian | None = None, **settings) -> tuple[PassiveTerminal, Told]:
     """A passive terminal with a told receiver and, if there is a state, a reference of this state
     at time 0."""
-    pt = passive_terminal(W, STEERED, Receivers(), Tracking(**settings), 8, AMPLITUDE)
+    pt = PassiveTerminal(W, STEERED, Receivers(), Tracking(**settings), 8, AMPLITUDE)
     reports = Told(list(answers))
     vars(pt)["receive"] = reports  # in place of the method
     if state is not None:
@@ -434,7 +433,7 @@ def test_an_active_terminal_hands_its_clutter_on_and_folds_its_echoes():
     the velocity. Planted bugs: clutter dropped; the period of one pass; half a period."""
     period = 299_792_458.0 / MIDDLE / (2 * W.slot_duration)
     clutter = ExpectedClutter(*(np.zeros(0),) * 3, *(np.zeros((0, 3)),) * 2)
-    at = active_terminal(W, ANTENNAS, Receivers(), Tracking())
+    at = ActiveTerminal(W, ANTENNAS, Receivers(), Tracking())
     z = np.asarray(what_is_measured(BODY, OWN), float)
     fold = np.array([-MIDDLE / W.slope, 1, 0, 0]) * period  # the same beat
     reports = Told([heard(None, [z + whole * fold]) for whole in (0, -1, 2)])
@@ -470,10 +469,10 @@ def test_mistakes_that_a_frame_shows_are_corrected_in_the_next():
     first = Correction(0.2 * np.log(10), np.array([0.3, 0.0, 0.0]))
     second = Correction(-0.05 * np.log(10), np.array([0.0, 0.2, 0.0]))
     reports = Told([heard(correction=c) for c in (first, None, second, None)])
-    at: Any = active_terminal(W, ANTENNAS, Receivers(), Tracking())
+    at: Any = ActiveTerminal(W, ANTENNAS, Receivers(), Tracking())
     for k in range(4):
         if k == 3:
-            kept, at = at.memory(), active_terminal(W, ANTENNAS, Receivers(), Tracking())
+            kept, at = at.memory(), ActiveTerminal(W, ANTENNAS, Receivers(), Tracking())
             at.restore(kept)
         vars(at)["receive"] = reports  # in place of the method
         at.step(EMPTY, None, OWN, 1e-6 * k, clutter=clutter)

@@ -13,10 +13,6 @@ import pytest
 from captures import Step, flat, save_capture
 from receiver_cubes import ANTENNAS, Path, cube
 
-from isac_rt.extensions.city_receivers.standard import (
-    active_terminal,
-    passive_terminal,
-)
 from isac_rt.frame.payload import (
     demodulate_bits,
     modulate,
@@ -60,7 +56,7 @@ def heard(frame: int, paths: list[Path], modulated: bool, snr_db: float = 5.0):
 
 
 def terminal() -> PassiveTerminal:
-    return passive_terminal(W, ANTENNAS, Receivers(), Tracking(), 8, 1.0)
+    return PassiveTerminal(W, ANTENNAS, Receivers(), Tracking(), 8, 1.0)
 
 
 def step(pt: PassiveTerminal, frame: int, paths: list[Path], modulated: bool):
@@ -185,7 +181,7 @@ def test_a_pilot_anchors_the_range_again():
 
 
 def test_the_active_terminal_tracks_an_echo():
-    at = active_terminal(W, ANTENNAS, Receivers(), Tracking())
+    at = ActiveTerminal(W, ANTENNAS, Receivers(), Tracking())
     for frame in range(5):
         length = 2 * (17.31 + 1.7 * INTERVAL * frame)
         samples, payload = heard(
@@ -208,7 +204,7 @@ def test_a_capture_is_all_that_a_terminal_needs(tmp_path, active):
         heard(f, [replace(sight(f), length=scale * sight(f).length, departure=ARRIVAL)], f > 1)
         for f in range(4)
     ]
-    live = active_terminal(W, ANTENNAS, Receivers(), Tracking()) if active else terminal()
+    live = ActiveTerminal(W, ANTENNAS, Receivers(), Tracking()) if active else terminal()
     steps = [
         Step(samples, OWN, f * INTERVAL, f > 1, payload if active else None)
         for f, (samples, payload) in enumerate(frames)

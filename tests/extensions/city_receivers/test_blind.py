@@ -17,12 +17,15 @@ from isac_rt.extensions.city_receivers.blind import (
     find_peaks,
     read_peaks,
 )
-from isac_rt.extensions.city_receivers.standard import passive_terminal
+from isac_rt.extensions.city_receivers.out_of_sequence import OutOfSequence
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.settings import Receivers
+from isac_rt.track.parts import Equipment
 from isac_rt.track.reference import TerminalState
 from isac_rt.track.settings import Tracking
+from isac_rt.track.terminal import PassiveTerminal
 from isac_rt.world.swarm import Pose
 
 W = Waveform(num_samples=256, num_chirps=48)
@@ -215,7 +218,9 @@ def terminal(amplitude, groups=None):
     receivers = Receivers(link_acquisition="blind", symbol_decision="beams")
     free = ANTENNAS.gain * W.wavelength / (4 * np.pi * 25)
     sent = amplitude / free
-    return passive_terminal(W, ANTENNAS, receivers, Tracking(), ORDER, sent, groups)
+    blind = OutOfSequence(PassiveReceiver.of(ANTENNAS, receivers, ORDER, groups), W)
+    settings = W, ANTENNAS, receivers, Tracking(), ORDER, sent, groups
+    return PassiveTerminal(*settings, Equipment(other_paths=blind))
 
 
 OWN = Pose.at_rest()

@@ -8,13 +8,16 @@ import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame
 from test_images import ORIGIN, VELOCITY, WALL, city, pose
 
-from isac_rt.extensions.city_receivers.standard import Surroundings, passive_terminal
+from isac_rt.extensions.city_receivers.out_of_sequence import OutOfSequence
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.receive.settings import Receivers
 from isac_rt.track.filter import Gaussian
+from isac_rt.track.parts import Equipment
 from isac_rt.track.reference import Followed
 from isac_rt.track.settings import Tracking
+from isac_rt.track.terminal import PassiveTerminal
 from isac_rt.track.tracker import Track
 from isac_rt.world.swarm import Pose
 
@@ -44,6 +47,14 @@ def ways(n, echo=0.08):
     return out
 
 
+def blind_terminal(transmit_amplitude):
+    """A passive terminal that reads over any path, and knows the wall."""
+    receivers = Receivers(link_acquisition="blind", symbol_decision="beams")
+    over_walls = OutOfSequence(PassiveReceiver.of(ANTENNAS, receivers, 8, None), W, city(WALL))
+    settings = W, ANTENNAS, receivers, Tracking(), 8, transmit_amplitude, None
+    return PassiveTerminal(*settings, Equipment(other_paths=over_walls))
+
+
 @pytest.mark.parametrize(
     ("said", "named"), [((0.0, 0.0, 0.0), True), ((0.0, -4.0, 0.0), False), (None, False)]
 )
@@ -55,11 +66,7 @@ def test_a_path_over_a_wall_is_named(said, named):
     _, schedule, _ = frame(waveform=W)
     rng = np.random.default_rng(3)
     free = ANTENNAS.gain * W.wavelength / (4 * np.pi * np.linalg.norm(IMAGE - OWN.position))
-    receivers = Receivers(link_acquisition="blind", symbol_decision="beams")
-    around = Surroundings(city(WALL))
-    terminal = passive_terminal(
-        W, ANTENNAS, receivers, Tracking(), 8, 5.0 / free, None, surroundings=around
-    )
+    terminal = blind_terminal(5.0 / free)
     for n in range(7):
         payload = random_payload(W, schedule, 8, rng)
         received = cube(W, schedule, payload, ways(n), noise=0.1, seed=n)
@@ -94,11 +101,7 @@ def test_a_reference_that_is_not_where_the_transmitter_is_becomes_a_path(told):
     _, schedule, _ = frame(waveform=W)
     rng = np.random.default_rng(4)
     free = ANTENNAS.gain * W.wavelength / (4 * np.pi * np.linalg.norm(IMAGE - OWN.position))
-    receivers = Receivers(link_acquisition="blind", symbol_decision="beams")
-    around = Surroundings(city(WALL))
-    terminal = passive_terminal(
-        W, ANTENNAS, receivers, Tracking(), 8, 0.5 / free, None, surroundings=around
-    )
+    terminal = blind_terminal(0.5 / free)
     for n in range(9):
         payload = random_payload(W, schedule, 8, rng) if n > 1 else unmodulated(W)
         received = cube(W, schedule, payload, ways(n, 0.04), noise=0.1, seed=n)
@@ -128,9 +131,8 @@ def test_the_city_is_expected_from_where_the_data_say(read):
         asked.append(state)
         raise Asked
 
-    terminal = passive_terminal(
-        W, ANTENNAS, Receivers(), Tracking(), 8, 1.0, surroundings=Surroundings(None, clutter)
-    )
+    equipment = Equipment(expect_clutter=clutter)
+    terminal = PassiveTerminal(W, ANTENNAS, Receivers(), Tracking(), 8, 1.0, equipment=equipment)
     told = Pose(SENDER, VELOCITY, np.zeros(3), np.eye(3))
     off = np.array([1.0, 0.0, 0.0, 0.0, 1.2, 0.0])
     tracked = Gaussian(np.concatenate([SENDER, VELOCITY]) + off, np.eye(6) * 1e-4)

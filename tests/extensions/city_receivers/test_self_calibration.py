@@ -9,7 +9,7 @@ import pytest
 from crb_model import bound, samples
 from receiver_cubes import ANTENNAS, Path, cube
 
-from isac_rt.extensions.city_receivers.known_paths import seen_after
+from isac_rt.extensions.city_receivers.known_paths import LearnedHardware, seen_after
 from isac_rt.extensions.city_receivers.neighbours import phases
 from isac_rt.extensions.city_receivers.self_calibration import (
     FREE,
@@ -17,7 +17,6 @@ from isac_rt.extensions.city_receivers.self_calibration import (
     KnownDirection,
     SelfCalibration,
 )
-from isac_rt.extensions.city_receivers.standard import active_terminal, passive_terminal
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
@@ -27,7 +26,9 @@ from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import ExpectedClutter, PathChannels
 from isac_rt.storage import pack, unpack
 from isac_rt.track.filter import Gaussian
+from isac_rt.track.parts import Equipment
 from isac_rt.track.settings import Tracking
+from isac_rt.track.terminal import ActiveTerminal, PassiveTerminal
 from isac_rt.world.swarm import Pose
 
 C = 299_792_458.0
@@ -217,6 +218,13 @@ def bent(values: np.ndarray, rng, schedule: np.ndarray) -> np.ndarray:
     return (out * sent[schedule][:, None, :, None]).astype(np.complex64)
 
 
+def calibrating(kind, waveform: Waveform, receivers: Receivers, **settings):
+    """A terminal that learns of its hardware."""
+    passes = 2 if kind is ActiveTerminal else 1
+    equipment = Equipment(hardware=LearnedHardware(waveform, ANTENNAS, passes))
+    return kind(waveform, ANTENNAS, receivers, Tracking(), equipment=equipment, **settings)
+
+
 def echo(distance: float, u, turn: float = 0.0) -> Path:
     u = tuple(u)
     return Path(2 * distance, 0.0, np.exp(1j * turn), u, u)
@@ -228,7 +236,7 @@ def test_samples_are_corrected_to_those_of_ideal_hardware():
     factor and -30 dB; by a ten times larger share without the slopes. Planted bugs: the delay put
     in and not taken out, the response of the wrong antenna, modes of the wrong parity."""
     late, mate = 0.456e-9 * C, np.array([0.11, -0.23])
-    at = active_terminal(W, ANTENNAS, Receivers(self_calibration="positions"), Tracking())
+    at = calibrating(ActiveTerminal, W, Receivers(self_calibration="positions"))
     payload = random_payload(W, SCHEDULE, 8, np.random.default_rng(2))
     truth = cube(W, SCHEDULE, payload, [echo(6.37, mate)])
     path = replace(echo(6.37, mate), length=2 * 6.37 + late)
@@ -255,7 +263,7 @@ def test_a_passive_terminal_finds_clock_and_gains_in_its_line_of_sight():
     turned the wrong way, the clock's rate not taken out."""
     u, rng, w = np.array([-0.17, 0.08]), np.random.default_rng(21), replace(W, num_samples=256)
     settings = Receivers(self_calibration="positions")
-    pt = passive_terminal(w, ANTENNAS, settings, Tracking(), 8, 1.0)
+    pt = calibrating(PassiveTerminal, w, settings, dpsk_order=8, transmit_amplitude=1.0)
     gains, level = errors(rng, 15), ANTENNAS.gain * w.wavelength / (4 * np.pi) / 20.0
     for frame in range(8):
         late = 31e-9 + 2e-9 * 0.05 * frame
@@ -324,7 +332,7 @@ def test_ten_frames_of_samples_bring_angles_within_1_db_of_the_bound():
         rng = np.random.default_rng(seed)
         sent, received = errors(rng, 3), errors(rng, 15)
         gain = received[None, :, None] * sent[SCHEDULE][:, None, :]
-        at = active_terminal(W, ANTENNAS, settings, Tracking())
+        at = calibrating(ActiveTerminal, W, settings)
         for frame in range(14):
             u = rng.uniform(-0.5, 0.5, (3, 2))
             places = (6.3, 0.0, *u[0]), (8.6, 0.0, *u[1]), (11.7, 2.0, *u[2])
