@@ -20,7 +20,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy import ndimage
 
-from isac_rt.extensions.city_receivers.angle_doppler import AngleDoppler, noise_level
+from isac_rt.extensions.city_receivers.adaptive import noise_level
+from isac_rt.extensions.city_receivers.angle_doppler import AngleDoppler, correct
 from isac_rt.extensions.city_receivers.power import cells_of, expected_power
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import Payload
@@ -32,7 +33,7 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
-from isac_rt.receive.types import ExpectedClutter, Hints
+from isac_rt.receive.types import ExpectedClutter
 from isac_rt.results.metrics import binomial_interval
 from reproduce.clutter_scenes import (
     PLACES,
@@ -243,8 +244,11 @@ def _ratios(
     if settings.clutter_detector == "cfar":
         rule = CfarRule.of(settings, known.channels)
         return [rule.ratio(accumulate(maps))[0] for maps in frames]
-    judged = AngleDoppler(settings, fitted=fitted).test_cells(frames, known, Hints(expected))
-    return [one.ratio for one in judged]
+    powers = [accumulate(maps) for maps in frames]
+    if fitted:
+        expected = correct(powers[0], known, expected).apply(expected)
+    detector, each = AngleDoppler(settings), zip(frames, powers, strict=True)
+    return [detector.test_cells(*one, known, expected)[0] for one in each]
 
 
 def _expected(scenes: Scenes, place: str, speed: float, mistakes: Mistakes) -> ExpectedClutter:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from isac_rt.extensions.city_receivers import adaptive, angle_doppler, bistatic
+from isac_rt.extensions.city_receivers import adaptive
 from isac_rt.frame.link import Link
 from isac_rt.propagation.pathset import PathKind
 from isac_rt.scenario.file import load
@@ -41,18 +41,15 @@ class Counter:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.counts, self.false = np.zeros((2, 3), int), 0
-        passive, active = bistatic.BeamSearch._test, angle_doppler.AngleDoppler._test
+        made = adaptive.DirectionTest.of
 
-        def noting(search, maps, noise, expected, known, clutter, left_over):
-            self.seen = known.waveform, expected / noise, left_over.power > 0, clutter is not None
-            return passive(search, maps, noise, expected, known, clutter, left_over)
+        def noting(settings, known, power, clutter, *taper):
+            test = made(settings, known, power, clutter, *taper)
+            if clutter is not None:
+                self.seen = known.waveform, test.expected / test.noise
+            return test
 
-        def noting_own(detector, maps, power, noise, expected, known, clutter):
-            self.seen = known.waveform, expected / noise, np.zeros(power.shape, bool), True
-            return active(detector, maps, power, noise, expected, known, clutter)
-
-        monkeypatch.setattr(bistatic.BeamSearch, "_test", noting)
-        monkeypatch.setattr(angle_doppler.AngleDoppler, "_test", noting_own)
+        monkeypatch.setattr(adaptive.DirectionTest, "of", noting)
 
     def look(self, observer: Station, frame) -> None:
         """Count a frame."""
@@ -60,9 +57,10 @@ class Counter:
         heard = observer.receive(frame, frame.received(observer.link), False)
         tracks = observer.record(frame, heard).tracks
         self.false += int((tracks.confirmed & (tracks.uav < 0)).sum())
-        if self.seen is None or not self.seen[3]:
+        if self.seen is None:
             return
-        w, held, beside, _ = self.seen
+        w, held = self.seen
+        beside = np.zeros(held.shape, bool)
         paths = frame.paths[observer.link]
         alone = paths.select(paths.kind != PathKind.DIFFUSE)
         level = frame.sent[observer.link.tx].amplitude ** 2 / frame.noise_power(observer.link)

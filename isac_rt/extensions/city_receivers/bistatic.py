@@ -23,27 +23,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isac_rt.extensions.city_receivers.adaptive import (
-    LEAST_CLUTTER,
-    field_threshold,
-    scanned,
-    unexplained,
-)
-from isac_rt.extensions.city_receivers.angle_doppler import noise_level
-from isac_rt.extensions.city_receivers.covariance import Bucketed
+from isac_rt.extensions.city_receivers.adaptive import DirectionTest, unexplained
 from isac_rt.extensions.city_receivers.echoes import Wave, Waves
-from isac_rt.extensions.city_receivers.power import TAPER, expected_power
-from isac_rt.receive.cfar import (
-    first_row,
-    strongest_peaks,
-)
-from isac_rt.receive.directions import (
-    PRUNED,
-    Search,
-    receiver_search,
-    search_plain,
-    search_white,
-)
+from isac_rt.receive.cfar import first_row, strongest_peaks
+from isac_rt.receive.directions import search_plain
 from isac_rt.receive.estimate import (
     Estimate,
     LocalSpectra,
@@ -55,8 +38,7 @@ from isac_rt.receive.known import Known
 from isac_rt.receive.maps import UNION_FLOOR, maps_with_power
 from isac_rt.receive.pursuit import BySchedule, extract_strong
 from isac_rt.receive.sense import Sensed, describe, window_gain
-from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import NO_HINTS, Detections, ExpectedClutter, Hints
+from isac_rt.receive.types import NO_HINTS, Detections, Hints
 
 ROUNDS = 4
 """Most searches, each of what the waves found before leave."""
@@ -75,7 +57,7 @@ class BeamSearch(BySchedule):
             return super().sense(spectra, known, hints)
         strong = extract_strong(spectra, known, self.settings)
         _, level = self.rule(known).detect(strong.whole)
-        test = _Test.of(self.settings, known, strong.power, hints.clutter)
+        test = DirectionTest.of(self.settings, known, strong.power, hints.clutter)
         found = Waves(spectra.copy(), known, test.noise / window_gain(known), test.search.beam)
         each = zip(strong.paths, strong.snr.tolist(), strict=True)
         found.take_out([self._strong(found, *path, test) for path in each])
@@ -85,7 +67,7 @@ class BeamSearch(BySchedule):
         joined = [describe(strong.paths, strong.snr, known), self._described(weak, test)]
         return Sensed(estimates, Detections.joined(joined), strong.whole, level)
 
-    def _strong(self, found: Waves, estimate: Estimate, power: float, test: _Test) -> Wave:
+    def _strong(self, found: Waves, estimate: Estimate, power: float, test: DirectionTest) -> Wave:
         """Return the wave of a path that stands out by such a power over the noise."""
         cosines = np.array(direction_cosines(estimate, test.known))
         cosines[test.search.beam == 0] = 0.0
@@ -94,7 +76,7 @@ class BeamSearch(BySchedule):
             cosines = search_plain(channels, test.search, 1.0, 0.0).cosines[0]
         return found.wave(estimate, cosines, power, strong=True)
 
-    def _weak(self, found: Waves, test: _Test) -> list[_Found]:
+    def _weak(self, found: Waves, test: DirectionTest) -> list[_Found]:
         """Return the waves that are found in what those before leave, and take them out."""
         left, known, strong = found.left, test.known, len(found.waves)
         most = self.settings.max_detections - strong
@@ -113,8 +95,9 @@ class BeamSearch(BySchedule):
             peaks = np.transpose(strongest_peaks(over, over > 1, self.settings, UNION_FLOOR))
             new = []
             for row, column in peaks[: most - len(weak)].tolist():
-                beam = _Beam(left, known, row, cosines[row, column])
-                e = self.estimator.at(beam, over, row, column)
+                towards = test.search.steering(cosines[row, column]).conj()
+                beam = np.tile(towards.astype(complex), (test.looks, 1))
+                e = self.estimator.at(LocalSpectra(left, known, row, beam=beam), over, row, column)
                 towards = near_beam(e, known, cosines[row, column])
                 towards = np.where(np.isfinite(towards), towards, cosines[row, column])
                 wave = found.wave(e, towards, power[row, column] / test.noise, strong=False)
@@ -133,7 +116,7 @@ class BeamSearch(BySchedule):
             rows = found.changed_rows()
         return weak
 
-    def _described(self, weak: list[_Found], test: _Test) -> Detections:
+    def _described(self, weak: list[_Found], test: DirectionTest) -> Detections:
         """Return waves as detections, with deviations by what their beams hold."""
         known, w = test.known, test.known.waveform
         statistic = np.array([f.ratio for f in weak]) * test.limits[0]
@@ -162,75 +145,3 @@ class _Found(NamedTuple):
     ratio: float
     cell: tuple[int, int]
     place: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Test:
-    """T of cells over its threshold.
-
-    Attributes
-    ----------
-    noise : of a cell of one channel
-    expected : (rows, P) power of the clutter, Doppler centred
-    limits : of T, of a detection and of one that may start a track
-    scatterers : the clutter by cell, None: nothing is known of it
-    """
-
-    known: Known
-    search: Search
-    noise: float
-    expected: np.ndarray
-    limits: tuple[float, float]
-    scatterers: Bucketed | None
-
-    @classmethod
-    def of(
-        cls, settings: Receivers, known: Known, power: np.ndarray, clutter: ExpectedClutter | None
-    ) -> _Test:
-        search, looks = receiver_search(known.antennas, known.wavenumber), known.antennas.num_tx
-        usual, sure = (
-            field_threshold(*scanned(search), looks, rate) for rate in settings.false_alarm_rates
-        )
-        expected = np.zeros_like(power)
-        if clutter is None:
-            noise = noise_level(power, None, known.channels)
-            return cls(known, search, noise, expected, (usual, sure), None)
-        expected = expected_power(clutter, known, len(power), TAPER)
-        noise = noise_level(power, expected, known.channels)
-        scatterers = Bucketed.of(clutter, known, search, noise, TAPER)
-        return cls(known, search, noise, expected, (usual, sure), scatterers)
-
-    def ratio(self, maps: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """T over the first threshold in rows (S,), (S, P), and its directions (S, P, 2), Doppler
-        centred, of `channel_maps` (L_tx, L_rx, S, P)."""
-        search, limit, shape = self.search, self.limits[0], maps.shape[2:]
-        least = PRUNED * limit
-        ratio = np.zeros(maps[0, 0].size, np.float32)
-        cosines = np.full((ratio.size, 2), np.nan)
-        x = maps.reshape(*maps.shape[:2], -1)
-        plain = search_plain(x, search, self.noise, least)
-        ratio[plain.cell], cosines[plain.cell] = plain.peak / limit, plain.cosines
-        if self.scatterers is not None:
-            held = (
-                np.fft.ifftshift(self.expected[rows], axes=1).ravel() > LEAST_CLUTTER * self.noise
-            )
-            cell = plain.cell[held[plain.cell] & (plain.peak > least)]
-            if cell.size:
-                at, bins = np.divmod(cell, shape[1])
-                R = self.scatterers.covariances(rows[at], bins)
-                y = x[:, :, cell].transpose(2, 0, 1) / np.float32(np.sqrt(self.noise))
-                white, common = search_white(y, R, cell, search, least)
-                ratio[cell], cosines[cell] = white.peak / (limit * common), white.cosines
-        ratio, cosines = (
-            np.fft.fftshift(a.reshape(*shape, *a.shape[1:]), axes=1) for a in (ratio, cosines)
-        )
-        return ratio, cosines
-
-
-class _Beam(LocalSpectra):
-    """The rows around a peak, of which only the power towards one direction counts."""
-
-    def __init__(self, spectra: np.ndarray, known: Known, row: int, cosines: np.ndarray) -> None:
-        towards = receiver_search(known.antennas, known.wavenumber).steering(cosines).conj()
-        beam = np.tile(towards.astype(complex), (known.antennas.num_tx, 1))
-        super().__init__(spectra, known, row, beam=beam)

@@ -10,10 +10,9 @@ import pytest
 from receiver_cubes import ANTENNAS, Path, cube, frame, known
 from scipy import stats
 
-from isac_rt.extensions.city_receivers.adaptive import expected_count, scanned
+from isac_rt.extensions.city_receivers.adaptive import expected_count, noise_level, scanned
 from isac_rt.extensions.city_receivers.angle_doppler import (
     AngleDoppler,
-    noise_level,
     over_walls,
 )
 from isac_rt.extensions.city_receivers.covariance import Bucketed
@@ -195,8 +194,10 @@ def test_detections_and_births_keep_their_rates_in_noise():
     settings = Receivers(
         clutter_detector="angle_doppler", false_alarm_rate=4e-3, update_false_alarm_rate=2e-2
     )
-    (judged,) = AngleDoppler(settings).test_cells([maps], sent, Hints(nothing))
-    for ratio, rate in ((judged.ratio, 2e-2), (judged.sure, 4e-3)):
+    detector = AngleDoppler(settings)
+    usual, _, test = detector.test_cells(maps, accumulate(maps), sent, nothing)
+    sure = usual * test.limits[0] / test.limits[1]
+    for ratio, rate in ((usual, 2e-2), (sure, 4e-3)):
         hits, cells = int((ratio > 1).sum()), ratio.size
         assert stats.binom.ppf(FALSE_FAILURE, cells, rate / 3) <= hits
         assert hits <= stats.binom.isf(FALSE_FAILURE, cells, rate)
@@ -263,11 +264,11 @@ def test_background_is_noise_and_expected_clutter():
     maps = maps_of(w, schedule, payload, [], FEW, 110, noise=0.7, seed=2)
     settings = Receivers(clutter_detector="angle_doppler")
     sent = known(w, schedule, payload, FEW)
-    (judged,) = AngleDoppler(settings).test_cells([maps], sent, Hints(guess))
-    noise = judged.level - expected_power(guess, sent, 110)
-    assert np.ptp(noise) < 1e-5 * judged.level.max()
+    detector = AngleDoppler(settings)
+    _, _, test = detector.test_cells(maps, accumulate(maps), sent, guess)
+    assert np.array_equal(test.expected, expected_power(guess, sent, 110))
     mean = (np.abs(maps) ** 2).mean()
-    assert noise.mean() == pytest.approx(mean, rel=0.05)  # the median of a third of the cells
+    assert test.noise == pytest.approx(mean, rel=0.05)  # the median of a third of the cells
 
 
 def test_ratio_of_the_cfar_is_its_decision():
@@ -426,7 +427,7 @@ def test_an_echo_over_a_wall_on_one_way_starts_no_track(ways, beside, clutter, s
     guess = expected([Path(60.0, 9.0, 0.05, (0.1, -0.1), (0.1, -0.1))])
     guess = guess if clutter else guess.select(np.zeros(1, bool))
     settings = Receivers(clutter_detector="angle_doppler")
-    d = AngleDoppler(settings, fitted=False).sense(spectra, sent, Hints(guess)).detections
+    d = AngleDoppler(settings).sense(spectra, sent, Hints(guess)).detections
     best = d.snr.argmax()
     assert abs(d.range[best] - 30.0) < w.range_cell(2)
     assert bool(d.starts[best]) is starts
@@ -456,7 +457,7 @@ def test_uavs_in_one_cell_are_told_apart_by_their_directions(clutter):
     if clutter:
         hints = Hints(expected([Path(60.0, 9.0, 0.02, (0.1, -0.5), (0.1, -0.5))]))
     settings = Receivers(clutter_detector="angle_doppler")
-    d = AngleDoppler(settings, fitted=False).sense(spectra, sent, hints).detections
+    d = AngleDoppler(settings).sense(spectra, sent, hints).detections
     for u in directions:
         off = np.where(d.starts, np.abs(d.direction - u).max(axis=1), np.inf)
         assert off.min() < (0.04 if clutter else 0.02)
@@ -471,7 +472,7 @@ def test_a_strong_wave_is_one():
     path = Path(60.0 + w.range_cell(1) * 0.47, 9.13, 6.0, (0.05, 0.02), (0.05, 0.02))
     spectra = clean_spectrum(cube(w, schedule, payload, [path], ANTENNAS, noise=1.0, seed=6), sent)
     settings = Receivers(clutter_detector="angle_doppler")
-    d = AngleDoppler(settings, fitted=False).sense(spectra, sent, no_clutter()).detections
+    d = AngleDoppler(settings).sense(spectra, sent, no_clutter()).detections
     assert (np.abs(d.range - path.length / 2) < 2 * w.range_cell(2)).sum() == 1
 
 

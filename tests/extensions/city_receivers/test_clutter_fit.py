@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from receiver_cubes import ANTENNAS, frame, known
 
-from isac_rt.extensions.city_receivers import correction
+from isac_rt.extensions.city_receivers import angle_doppler, correction
 from isac_rt.extensions.city_receivers.angle_doppler import AngleDoppler
 from isac_rt.extensions.city_receivers.correction import UNTAPERED, fit
 from isac_rt.extensions.city_receivers.power import TAPER, Response, expected_power
 from isac_rt.frame.waveform import Waveform
+from isac_rt.receive.maps import accumulate
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.types import ExpectedClutter, Hints
 
@@ -152,7 +153,7 @@ def test_a_level_expected_far_too_low_is_found(too_low_db: float):
     assert fit(white, noise, low, one).level == 0
 
 
-def test_detectors_judge_with_the_corrected_clutter():
+def test_detectors_judge_with_the_corrected_clutter(monkeypatch: pytest.MonkeyPatch):
     """Circular Gaussian cells of the clutter's own mean; the terminal believes in a third of the
     power and 0.15 m/s too much. The level that its detector rests on is the true one: 15 % at
     the median over cells with clutter, 5 % in all. Planted bugs: the map not made anew; the
@@ -172,12 +173,14 @@ def test_detectors_judge_with_the_corrected_clutter():
         / np.sqrt(2)
     )
     maps = (white * np.fft.ifftshift(np.sqrt(mean), axes=1)).astype(np.complex64)
-    detector = AngleDoppler(Receivers(clutter_detector="angle_doppler"))
-    (judged,) = detector.test_cells([maps], known(W, schedule, payload), Hints(wrong))
+    monkeypatch.setattr(angle_doppler, "maps_with_power", lambda *_: (maps, accumulate(maps)))
+    detector = AngleDoppler(Receivers(clutter_detector="angle_doppler", max_detections=1))
+    spectra = np.zeros((len(schedule), ANTENNAS.num_rx, *mean.shape), np.complex64)
+    level = detector.sense(spectra, known(W, schedule, payload), Hints(wrong)).level
     strong = mean > 3 * noise
-    off = judged.level[strong] / mean[strong] - 1
+    off = level[strong] / mean[strong] - 1
     assert strong.sum() > 500 and np.median(np.abs(off)) < 0.15
-    assert judged.level[strong].sum() / mean[strong].sum() == pytest.approx(1, abs=0.05)
+    assert level[strong].sum() / mean[strong].sum() == pytest.approx(1, abs=0.05)
 
 
 def test_noise_alone_corrects_nothing():
