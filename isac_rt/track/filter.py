@@ -3,7 +3,7 @@ update and initiation."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -245,43 +245,19 @@ def update(
 
     Iterated EKF in Joseph's form: linearisation at the new mean until it converges (Gauss-Newton on
     the posterior), because a range known to a millimetre over a cross-range known to a metre is
-    visibly nonlinear. Of ambiguous velocities the nearest to the state's counts.
+    visibly nonlinear. A converged state does not change any more. Of ambiguous velocities the
+    nearest to the state's counts.
     """
     rows = np.flatnonzero(np.isfinite(measurement).reshape(-1, 4).all(axis=0))
-    return _updated(g, measurement, R, rows, own, transmitter, ambiguity)
-
-
-def _updated(
-    g: Gaussian,
-    measurement: np.ndarray,
-    R: np.ndarray,
-    rows: np.ndarray,
-    own: Pose,
-    transmitter: np.ndarray | None,
-    ambiguity: Ambiguity,
-) -> Gaussian:
-    """Return `update` by the `rows` of the measurements."""
-
-    def seen(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        off = wrapped(measurement - measure(x, own, transmitter), ambiguity)
-        return off[..., rows], jacobian(x, own, transmitter)[..., rows, :]
-
-    return conditioned(g, R[..., rows[:, None], rows], seen)
-
-
-def conditioned(
-    g: Gaussian, R: np.ndarray, seen: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-) -> Gaussian:
-    """Condition states (..., S) on measurements (..., n) of covariances R by the iterated EKF in
-    Joseph's form. `seen` returns, at states, the measurements less the expected ones and the
-    derivatives H (..., n, S) of the latter. A converged state does not change any more."""
+    R = R[..., rows[:, None], rows]
     mean, P = g
     x, moving = mean, np.ones(mean.shape[:-1], bool)
     enough = 1e-3 * np.sqrt(np.diagonal(P, axis1=-2, axis2=-1)) + ROUNDING
-    K, H = np.zeros((*mean.shape, R.shape[-1])), np.zeros((*R.shape[:-1], mean.shape[-1]))
+    K, H = np.zeros((*mean.shape, rows.size)), np.zeros((*R.shape[:-1], mean.shape[-1]))
     for _ in range(_ITERATIONS):
         # K = P H^T S^-1, S = H P H^T + R; x = mean + K (z - h(x) - H (mean - x))
-        off, at_x = seen(x)
+        off = wrapped(measurement - measure(x, own, transmitter), ambiguity)[..., rows]
+        at_x = jacobian(x, own, transmitter)[..., rows, :]
         H = np.where(moving[..., None, None], at_x, H)
         gain = np.linalg.solve(H @ P @ np.swapaxes(H, -1, -2) + R, H @ P)  # S^-1 H P
         K = np.swapaxes(gain, -1, -2)
@@ -363,28 +339,6 @@ def bistatic_distance(
     return np.asarray((length**2 - baseline @ baseline) / (2 * (length - ahead)))
 
 
-def initiate(
-    measurement: np.ndarray,
-    std: np.ndarray,
-    own: Pose,
-    transmitter: Gaussian | None = None,
-    *,
-    acceleration_std: float,
-    ambiguity: Ambiguity = UNAMBIGUOUS,
-) -> Gaussian | None:
-    """Return the state after a first detection (4,) with deviations (4,); None if it does not fix a
-    position (`initiate_all`)."""
-    which, states = initiate_all(
-        measurement[None],
-        std[None],
-        own,
-        transmitter,
-        acceleration_std=acceleration_std,
-        ambiguity=ambiguity,
-    )
-    return Gaussian(states.mean[0], states.covariance[0]) if which.size else None
-
-
 @np.errstate(invalid="ignore", divide="ignore")  # a target at the transmitter's position
 def initiate_all(
     measurement: np.ndarray,
@@ -439,8 +393,9 @@ def initiate_all(
     P[:, :3, :3] += bent * along * np.swapaxes(along, 1, 2)
     near = np.trace(P[:, :3, :3], axis1=1, axis2=2) <= INITIAL_POSITION_STD_LIMIT**2
     which, mean, read, R, P = (a[near] for a in (which, mean, read, R, P))
-    rate = np.array([1])
-    return which, _updated(Gaussian(mean, P), read, R, rate, own, there, UNAMBIGUOUS)
+    rate = np.full_like(read, np.nan)
+    rate[:, 1] = read[:, 1]
+    return which, update(Gaussian(mean, P), rate, R, own, there)
 
 
 def resting(measurement: np.ndarray, own: Pose, transmitter: np.ndarray | None) -> np.ndarray:

@@ -24,7 +24,7 @@ from isac_rt.track.filter import (
     Ambiguity,
     Gaussian,
     expected,
-    initiate,
+    initiate_all,
     measurement_covariance,
     predict,
     update,
@@ -195,8 +195,10 @@ class Reference(Stateful):
 
     def _restart(self, d: Detections, q: int, std: np.ndarray, own: Pose, tracker: Tracker) -> None:
         """Start the track from detection `q`; the other tracks rested on the old one."""
-        state = initiate(d.measured[q], std, own, acceleration_std=self._acceleration_std)
-        if state is not None:
+        acceleration_std = self._acceleration_std
+        states = initiate_all(d.measured[[q]], std[None], own, acceleration_std=acceleration_std)[1]
+        if len(states.mean):
+            state = Gaussian(states.mean[0], states.covariance[0])
             number, snr = tracker.new_id(), float(d.snr[q])
             self.state.track = Track(number, state, snr, confirmed=True, detection=q)
             self.state.ends = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from one_detection import initiate
 from oracles import slopes, what_is_measured
 from scipy.optimize import least_squares
 
@@ -13,7 +14,6 @@ from isac_rt.track.filter import (
     Ambiguity,
     Gaussian,
     expected,
-    initiate,
     measure,
     measurement_covariance,
     predict,

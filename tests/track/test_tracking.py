@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from one_detection import initiate
 from scipy.stats import chi2
 
 from isac_rt.receive.types import Detections
@@ -19,7 +20,6 @@ from isac_rt.track.filter import (
     bistatic_distance,
     curvature,
     expected,
-    initiate,
     jacobian,
     measure,
     measurement_covariance,
