@@ -735,7 +735,7 @@ OF_TESTS = (
         Bug(
             "plain.py",
             "{f.name: plain(getattr(value, f.name)) for f in fields(value) if f.init}",
-            '{f.name: 0 if f.name == "slips_repaired" else plain(getattr(value, f.name)) for f in fields(value) if f.init}',
+            '{f.name: 0 if f.name == "status" else plain(getattr(value, f.name)) for f in fields(value) if f.init}',
         ),
     ),
     (

@@ -54,7 +54,6 @@ from isac_rt.simulation.preflight import (
     warn_of_unseen,
 )
 from isac_rt.simulation.stopwatch import NONE, Seconds
-from isac_rt.track.expectation import ClutterExpectation
 from isac_rt.world.area import city_about, city_digest
 from isac_rt.world.city import CityMesh
 from isac_rt.world.city.materials import believed_materials
@@ -251,9 +250,10 @@ class Setup:
     timetable: Timetable
     connections: Connections
     plan: Plan
-    expectation: ClutterExpectation | None
-    """Clutter that an active terminal's receiver expects from the mesh; None if its detector uses
-    none."""
+    expectation: Any
+    """Clutter that receivers expect from the mesh
+    (`isac_rt.extensions.city_receivers.expectation.MeshExpectation`); None if no detector uses
+    it."""
     seconds: Seconds = NONE
     """Time that `prepare` took."""
     by_chirp: tuple[Setup, ...] = ()
@@ -704,18 +704,14 @@ def _extended(
     return model
 
 
-def _expectation_of(
-    scenario: Scenario, plan: Plan, free: FreeSpace, believed: CityMesh
-) -> ClutterExpectation | None:
+def _expectation_of(scenario: Scenario, plan: Plan, free: FreeSpace, believed: CityMesh) -> Any:
     if not scenario.needs_mesh:
         return None
     about = scenario.clutter, plan.swarm, believed, plan.waveform
     monostatic = [link for link in plan.timetable.all_links if link.own]
     floor = _floor_of(scenario, plan, free, monostatic)
-    make = extension("expected_clutter")
     level = scenario.belief.level_db
-    expectation: ClutterExpectation = make(*about, plan.arrays, scenario.seed, floor, level)
-    return expectation
+    return extension("expected_clutter")(*about, plan.arrays, scenario.seed, floor, level)
 
 
 def _believed_city(scenario: Scenario, city: CityMesh) -> CityMesh:

@@ -64,7 +64,7 @@ def terminal_with(setup: Setup, link: Link, made: Terminal | Receiver) -> Termin
             "terminal or an object with receive"
         )
     out = standard_terminal(setup, link)
-    out.other = made
+    vars(out)["receive"] = made.receive  # in place of the method
     return out
 
 

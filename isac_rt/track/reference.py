@@ -83,7 +83,6 @@ class Followed:
     time : that it was predicted to last [s]
     status : of the link
     read : whether the last data frame was read
-    slips_repaired : times that the range was moved by whole cells while data flowed
     ends : symbols at and beyond the alphabet's ends, by frame, the newest last
     report : the transmitter as its data reported it last; None: they never did
     """
@@ -92,7 +91,6 @@ class Followed:
     time: float = -np.inf
     status: TerminalState = TerminalState.ACQUIRING
     read: bool = False
-    slips_repaired: int = 0
     ends: list[np.ndarray] = field(default_factory=list)
     report: Track | None = None
 

@@ -120,7 +120,6 @@ class ActiveTerminal(Stateful):
                 "tracking.initiation unexplained needs rules, as those of a city's walls"
             )
         self._receiver = ActiveReceiver.of(antennas, receivers)
-        self.other: Receiver | None = None
         self.tracker = Tracker(tracking, Ambiguity.of(waveform, 2))
         self._hints = NO_HINTS
         self.state = OwnErrors()
@@ -174,10 +173,7 @@ class ActiveTerminal(Stateful):
         clutter: ExpectedClutter | None,
         maps: bool,
     ) -> Reception:
-        """Return what the terminal makes of one frame's samples; a custom receiver replaces this,
-        or is `other`, which is given the same."""
-        if self.other is not None:
-            return self.other.receive(cube, payload, clutter, maps)
+        """Return what the terminal makes of one frame's samples; custom receivers replace it."""
         return self._receiver.receive(cube, payload, self._hints, maps=maps)
 
 
@@ -209,7 +205,6 @@ class PassiveTerminal(Stateful):
         equipment: Equipment | None = None,
     ) -> None:
         self._receiver = PassiveReceiver.of(antennas, receivers, dpsk_order, groups)
-        self.other: Receiver | None = None
         self.tracker = Tracker(tracking, Ambiguity.of(waveform, 1))
         self.equipment = equipment or Equipment()
         self.reference = Reference(waveform, antennas, tracking, transmit_amplitude, groups)
@@ -335,7 +330,6 @@ class PassiveTerminal(Stateful):
         if not again.decoded:
             track.state = before
             return reception
-        self.reference.state.slips_repaired += 1
         return again
 
     def _receive(
@@ -365,8 +359,5 @@ class PassiveTerminal(Stateful):
     def receive(
         self, cube: IFCube, prediction: Prediction | None, modulated: bool, maps: bool
     ) -> Reception:
-        """Return what the terminal makes of one frame's samples; a custom receiver replaces this,
-        or is `other`, which is given the same."""
-        if self.other is not None:
-            return self.other.receive(cube, prediction, modulated, maps)
+        """Return what the terminal makes of one frame's samples; custom receivers replace it."""
         return self._receiver.receive(cube, prediction, modulated, self._hints, maps=maps)

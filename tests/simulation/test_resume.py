@@ -177,7 +177,7 @@ def counted(value, step=1):
 def test_everything_that_is_carried_over_is_taken_up(tmp_path):
     """Every attribute of every receiver, tracker, track, scorer and schedule after four frames,
     counts made different from each other and from nothing. Planted bugs: a scorer's labels, the
-    time of a tracker, the next track's number, the repaired slips, or the feedback forgotten."""
+    time of a tracker, the next track's number, the status of a link, or the feedback forgotten."""
     scenario = dense_scenario(frames=5).model_copy(
         update={"compare": {"other": ReceiverSet(receivers=Receivers(), tracking=Tracking())}}
     )

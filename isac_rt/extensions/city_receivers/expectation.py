@@ -23,7 +23,6 @@ from isac_rt.propagation.scatter_paths import LinkState
 from isac_rt.propagation.settings import Clutter
 from isac_rt.randomness import seed_sequence
 from isac_rt.receive.types import ExpectedClutter
-from isac_rt.track.expectation import ClutterExpectation
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose, Swarm
 
@@ -141,7 +140,7 @@ def make_expectation(
     seed: int,
     floor: NoiseFloor | None = None,
     level_db: float = 0.0,
-) -> ClutterExpectation:
+) -> MeshExpectation:
     """The receivers' copy of the mesh; starts the JIT back end. `floor`: of the active terminals'
     own links; None: nothing is merged. `level_db`: error of the expected level."""
     from isac_rt import runtime
@@ -150,7 +149,6 @@ def make_expectation(
     from isac_rt.world.city.scene import shared_scenes
 
     scene = shared_scenes(city, waveform.carrier_frequency).faces
-    about = clutter, swarm, city, scene, arrays, waveform.wavelength, seed, floor
-    found = MeshExpectation(*about)
+    found = MeshExpectation(clutter, swarm, city, scene, arrays, waveform.wavelength, seed, floor)
     found.level = 10 ** (level_db / 20)
     return found
