@@ -175,15 +175,6 @@ def demodulate_bits(
     )
 
 
-def gray_bits(count: int) -> np.ndarray:
-    """(count, log2 count) bits of the symbols 0 .. count - 1, most significant first."""
-    return (
-        _unpack(_gray_encode(np.arange(count)), count.bit_length() - 1)
-        .reshape(count, -1)
-        .astype(float)
-    )
-
-
 def running_phases(transitions: np.ndarray, schedule: Schedule, dpsk_order: int) -> np.ndarray:
     """beta_p' = prod_{i<p'} S_i of each antenna, put back at the chirps that it sends. (M, P)
     complex128.

@@ -215,7 +215,6 @@ class PassiveReceiver:
             delay_confidence=symbols.delay_confidence,
             transition_confidence=symbols.transition_confidence,
             raw_delay_symbols=symbols.raw,
-            soft_bits=symbols.soft_bits,
             confidence_looks=symbols.looks,
         )
 

@@ -42,8 +42,7 @@ class Receivers(Node):
     Cramer-Rao bound, separating paths in one cell; slower."""
     symbol_decision: Annotated[str, SYMBOL_READERS] = "powers"
     """How a passive terminal reads symbols. `powers`, the default and the paper's: sum of the
-    antennas' powers. `beams`: coherent sum towards the tracked paths, with a log-likelihood ratio
-    for every bit; the most sensitive."""
+    antennas' powers. `beams`: coherent sum towards the tracked paths; the most sensitive."""
     separate_reference: bool = False
     """Whether a passive terminal separates its line of sight, by direction, from a reflection in
     the same cell before it uses the range. It costs time where one wave does not fit. Off by

@@ -16,7 +16,7 @@ alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -85,8 +85,7 @@ class Symbols:
     |sum y conj(y')| / sum |y y'|, in [0, 1]. `phase_spread` is the RMS distance of the transitions
     from their symbols [rad], `least_spread` the least that it is for any velocity within
     `PREDICTED_STDS` deviations of the predicted one; None: the same. `gathering` compares these
-    velocities with all others; None: not compared. `looks` receivers are added in
-    power. `soft_bits` are the bits' log-likelihood ratios ln P(0)/P(1), from beams only.
+    velocities with all others; None: not compared. `looks` receivers are added in power.
     """
 
     raw: np.ndarray
@@ -98,7 +97,6 @@ class Symbols:
     phases: np.ndarray
     bits: np.ndarray
     looks: int
-    soft_bits: np.ndarray = field(default_factory=lambda: np.zeros(0))
     least_spread: float | None = None
     gathering: Gathering | None = None
 
@@ -118,7 +116,6 @@ class Symbols:
                 transitions=transitions,
                 phases=running_phases(transitions, known.schedule, order),
                 bits=demodulate_bits(self.delay, transitions, known.waveform, order),
-                soft_bits=np.zeros(0),
             )
             if again.is_intact(known.waveform, order):
                 return again

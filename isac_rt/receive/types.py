@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -211,8 +211,6 @@ class Reception:
     reference_power : mean power of the reference path per sample and receive antenna [W], NaN where
         there is none
     maps : Maps or None
-    soft_bits : (bits,) log-likelihood ratios ln P(0)/P(1) of `bits`; empty when not decoded, or
-        decided from powers or in retrospect
     confidence_looks : receivers whose noise is independent in a delay confidence, a mean of so many
         exponentials; 0 when not decoded
     sparse : where the velocities came from sparse sampling with OMP or from a conventional
@@ -240,7 +238,6 @@ class Reception:
     line_of_sight: bool
     reference_power: float
     maps: Maps | None = None
-    soft_bits: np.ndarray = field(default_factory=lambda: np.zeros(0))
     confidence_looks: int = 0
     sparse: bool | None = None
     correction: Correction | None = None
@@ -300,7 +297,6 @@ class Reception:
             delay_symbols=np.full_like(self.delay_symbols, -1),
             transitions=np.full_like(self.transitions, -1),
             bits=np.zeros(0, np.uint8),
-            soft_bits=np.zeros(0),
             raw_delay_symbols=np.zeros((0, self.raw_delay_symbols.shape[1]), int),
             line_of_sight=False,
         )

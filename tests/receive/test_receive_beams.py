@@ -1,4 +1,4 @@
-"""Symbol decisions from beams and soft bits, beside the paper's on the same samples."""
+"""Symbol decisions from beams, beside the paper's on the same samples."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from scipy import special, stats
 
 from isac_rt.extensions.city_receivers.beams import _likelihood, demodulate_beams
 from isac_rt.frame.cube import IFCube
-from isac_rt.frame.payload import gray_bits
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.settings import Receivers
@@ -120,83 +119,17 @@ def test_likelihood_of_cells_knows_the_noise_and_the_signal():
 def test_gain_of_beams_over_signal_to_noise():
     """Both decisions on the same samples; run with -s for the table."""
     payload, clean = link(*ALONE)
-    print(
-        "\nSNR dB  delay SER powers, beams   DPSK SER powers, beams   bit: soft, hard information"
-    )
+    print("\nSNR dB  delay SER powers, beams   DPSK SER powers, beams")
     for snr_db in range(-27, -13, 2):
         rates = np.zeros((2, 2))
-        soft, hard = 0.0, 0.0
         for seed in range(6):
             signal = noisy(clean, snr_db, 100 + seed)
-            beams = demodulate_beams(signal, NEAR, ANTENNAS, ORDER)
-            rates += (
-                np.array([errors(demodulate(signal, NEAR, ORDER), payload), errors(beams, payload)])
-                / 6
-            )
-            soft, hard = (
-                soft + information(beams.soft_bits, payload.bits) / 6,
-                hard + binary(np.mean(beams.bits != payload.bits)) / 6,
-            )
+            powers = errors(demodulate(signal, NEAR, ORDER), payload)
+            beams = errors(demodulate_beams(signal, NEAR, ANTENNAS, ORDER), payload)
+            rates += np.array([powers, beams]) / 6
         (d0, p0), (d1, p1) = rates
-        print(
-            f"{snr_db:6d}  {d0:12.4f}, {d1:6.4f}  {p0:18.4f}, {p1:6.4f}  {soft:16.3f}, {hard:5.3f}"
-        )
-        assert (
-            d1 <= d0 and p1 <= p0 and soft >= hard - 1e-5
-        )  # what a ratio of e^-15 costs where nothing is wrong
-
-
-def information(soft: np.ndarray, bits: np.ndarray) -> float:
-    """Bits per bit that a decoder may draw from the ratios."""
-    return float(1 - np.logaddexp(0, -soft * (1 - 2.0 * bits)).mean() / np.log(2))
-
-
-def binary(rate: float) -> float:
-    """The same from hard decisions at an error rate."""
-    p = min(max(rate, 1e-12), 0.5)
-    return float(1 + p * np.log2(p) + (1 - p) * np.log2(1 - p))
-
-
-def test_soft_bits_are_worth_what_they_say():
-    """Bits of a ratio of L are wrong in 1/(1 + e^|L|) of all cases: six frames, delay and phase
-    bits apart, bins of |L|, four deviations of a binomial of a third as many trials, for the bits
-    of one symbol err together. They hold more than the hard decisions. Planted bugs: ln I_0 without
-    the factor 2; bits in another order."""
-    payload, clean = link(*ALONE)
-    soft, wrong, gain = [], [], 0.0
-    for seed in range(6):
-        found = demodulate_beams(noisy(clean, -26.0, seed), NEAR, ANTENNAS, ORDER)
-        assert (
-            (found.soft_bits < 0) == found.bits
-        ).mean() > 0.95  # a symbol's best bits are nearly always the bits' best
-        soft.append(found.soft_bits)
-        wrong.append((found.soft_bits < 0) != payload.bits)
-        gain += (
-            information(found.soft_bits, payload.bits) - binary(np.mean(found.bits != payload.bits))
-        ) / 6
-    size, missed = np.abs(soft), np.array(wrong)
-    for part in (slice(0, payload.num_delay_bits), slice(payload.num_delay_bits, None)):
-        for low, high in ((0.0, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 4.0)):
-            inside = (size[:, part] >= low) & (size[:, part] < high)
-            expected = float((1 / (1 + np.exp(size[:, part][inside]))).mean())
-            assert inside.sum() > 500
-            assert abs(missed[:, part][inside].mean() - expected) < 4 * np.sqrt(
-                3 * expected * (1 - expected) / inside.sum()
-            )
-    assert gain > 0.05
-
-
-def test_gray_bits_are_those_of_the_payload():
-    assert gray_bits(8).astype(int).tolist() == [
-        [0, 0, 0],
-        [0, 0, 1],
-        [0, 1, 1],
-        [0, 1, 0],
-        [1, 1, 0],
-        [1, 1, 1],
-        [1, 0, 1],
-        [1, 0, 0],
-    ]
+        print(f"{snr_db:6d}  {d0:12.4f}, {d1:6.4f}  {p0:18.4f}, {p1:6.4f}")
+        assert d1 <= d0 and p1 <= p0
 
 
 def test_a_wrong_velocity_is_found_from_the_phases():
@@ -234,12 +167,11 @@ def test_two_paths_carry_each_other():
 
 
 def test_reception_with_beams():
-    """Through the receiver: bits and their ratios; noise alone is not decoded; without a direction
+    """Through the receiver: bits; noise alone is not decoded; without a direction
     the powers decide. Planted bug: the confidence held against the law of 15 receivers."""
     settings, (payload, clean) = Receivers(symbol_decision="beams"), link(*ALONE)
     r = receive_passive(noisy(clean, -10.0, 4), ANTENNAS, settings, ORDER, NEAR, True)
     assert r.decoded and np.array_equal(r.bits, payload.bits) and r.confidence_looks == 1
-    assert ((r.soft_bits < 0) == payload.bits).all()
     silent = replace(clean, samples=np.zeros_like(clean.samples))
     for seed in range(3):
         assert not receive_passive(
@@ -247,4 +179,4 @@ def test_reception_with_beams():
         ).decoded
     blind = replace(NEAR, direction=np.full((1, 2), np.nan))
     r = receive_passive(noisy(clean, -10.0, 4), ANTENNAS, settings, ORDER, blind, True)
-    assert r.decoded and r.soft_bits.size == 0 and r.confidence_looks == 15
+    assert r.decoded and r.confidence_looks == 15

@@ -1,4 +1,4 @@
-"""Symbol decisions from beams towards the predicted paths, and what every bit is worth.
+"""Symbol decisions from beams towards the predicted paths.
 
 The paper adds the powers of the receivers. Once the directions are tracked, the receivers can be
 added in phase: one beam per predicted path, with the other paths that share its range cells kept
@@ -11,18 +11,18 @@ of them at once and taken out.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import special
 
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
-from isac_rt.frame.payload import by_antenna, demodulate_bits, gray_bits, running_phases
+from isac_rt.frame.payload import by_antenna, demodulate_bits, running_phases
 from isac_rt.frame.schedule import Schedule
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.clutter_filter import chirp_runs
 from isac_rt.receive.spectrum import tones, transform
 from isac_rt.receive.symbols import (
-    EXTRA_CELLS,
     WEAKEST_WEIGHT,
     ByPowers,
     Symbols,
@@ -58,13 +58,9 @@ def beam_weights(
     w_k ~ (sum_j g_j a_j a_j^H + loading I)^-1 a_k over the paths that share k's cells; alone this
     is the plain beam.
     """
-    j_omega = 2j * np.pi * waveform.effective_carrier
-    steer = np.exp(
-        [
-            j_omega * element_delays(antennas.rx_positions, u, max(r, waveform.range_cell(1)))[0]
-            for u, r in zip(prediction.direction, prediction.range, strict=True)
-        ]
-    )
+    radius = np.maximum(prediction.range, waveform.range_cell(1))[:, None]
+    delays = element_delays(antennas.rx_positions, prediction.direction, radius)[0]
+    steer = np.exp(2j * np.pi * waveform.effective_carrier * delays)
     out = np.empty_like(steer)
     for k, a in enumerate(steer):
         near = np.abs(beats - beats[k]) < SHARED_CELLS
@@ -112,12 +108,6 @@ def demodulate_beams(
         product[k] *= np.exp(-2j * np.pi * rate * w.effective_carrier * length)
         summed += product[k] * (2 * snr[k] / (noise[k] * (1 + 2 * snr[k])))
     transitions, spread = nearest_symbols(summed, dpsk_order)
-    own = likelihood[..., EXTRA_CELLS:-EXTRA_CELLS]
-    soft_delay, right = soft_delay_bits(own)
-    chains = by_antenna(right, cube.schedule, w.num_tx)
-    soft = np.concatenate(
-        [soft_delay, soft_phase_bits(summed, chains[..., 1:] * chains[..., :-1], dpsk_order)]
-    )
     return Symbols(
         raw=raw,
         delay=delay,
@@ -128,7 +118,6 @@ def demodulate_beams(
         phases=running_phases(transitions, cube.schedule, dpsk_order),
         bits=demodulate_bits(delay, transitions, w, dpsk_order),
         looks=1,
-        soft_bits=soft,
     )
 
 
@@ -203,43 +192,14 @@ def rate_error(
     constellation falls on its symbols; parabola through the three points."""
     raised = np.abs(product) * np.exp(1j * order * np.angle(product))
     rates = np.linspace(-far, far, VELOCITY_STEPS)
-    fit = [
-        float(
-            (raised * np.exp(-2j * np.pi * order * r * waveform.effective_carrier * length))
-            .sum()
-            .real
-        )
-        for r in rates
-    ]
+    turn = -2j * np.pi * order * waveform.effective_carrier * length
+    fit = np.array([(raised * np.exp(r * turn)).sum().real for r in rates])
     i = int(np.clip(np.argmax(fit), 1, VELOCITY_STEPS - 2))
-    before, peak, after = fit[i - 1 : i + 2]
-    second = before - 2 * peak + after
-    return float(
-        rates[i] + (0.5 * (before - after) / second if second < 0 else 0.0) * (rates[1] - rates[0])
-    )
+    return float(rates[i] + vertex(*fit[i - 1 : i + 2]) * (rates[1] - rates[0]))
 
 
-def soft_delay_bits(likelihood: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Log-likelihood ratios ln P(0)/P(1) of the delay bits, in the order of the payload, and the
-    probability of each chirp's best symbol, from log likelihoods (M, P, N/2)."""
-    probability = special.softmax(likelihood, axis=-1)
-    return _bit_ratios(probability), probability.max(axis=-1)
-
-
-def soft_phase_bits(summed: np.ndarray, right: np.ndarray, order: int) -> np.ndarray:
-    """Log-likelihood ratios ln P(0)/P(1) of the DPSK bits, in the order of the payload.
-
-    Given the earlier chirp the later one is Gaussian about its turned copy, so that a symbol's log
-    likelihood is Re(z exp(-j phase)) with z the product scaled by 2 g / (N (1 + 2 g)), g the SNR
-    and N the noise of a cell. Unless both delay symbols are `right`, the phase says nothing.
-    """
-    phase = 2 * np.pi / order * np.arange(order)
-    probability = special.softmax((summed[..., None] * np.exp(-1j * phase)).real, axis=-1)
-    return _bit_ratios(right[..., None] * probability + (1 - right[..., None]) / order)
-
-
-def _bit_ratios(probability: np.ndarray) -> np.ndarray:
-    """ln P(0)/P(1) of the Gray bits of symbols (..., S), flat."""
-    bits = gray_bits(probability.shape[-1])
-    ones, zeros = (probability @ bits).reshape(-1), (probability @ (1.0 - bits)).reshape(-1)
-    return np.log(np.maximum(zeros, 1e-30)) - np.log(np.maximum(ones, 1e-30))
+def vertex(before: ArrayLike, peak: ArrayLike, after: ArrayLike) -> np.ndarray:
+    """Where a parabola through three points has its top, in steps from the middle."""
+    before, after = np.asarray(before), np.asarray(after)
+    curvature = np.minimum(before - 2 * np.asarray(peak) + after, -1e-300)
+    return np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)

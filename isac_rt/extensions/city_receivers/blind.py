@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaincinv
 
-from isac_rt.extensions.city_receivers.beams import rate_error, transitions_of
+from isac_rt.extensions.city_receivers.beams import rate_error, transitions_of, vertex
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import by_antenna, demodulate_bits, running_phases
@@ -306,18 +306,12 @@ def _threshold(waveform: Waveform) -> float:
     return float(np.log(2 * waveform.num_samples / FALSE_RATE))
 
 
-def _vertex(before: np.ndarray, peak: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Where a parabola through three points has its top, in steps from the middle."""
-    curvature = np.minimum(before - 2 * peak + after, -1e-300)
-    return np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)
-
-
 def _offset(before: np.ndarray, peak: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Where a tone lies between half cells, in cells from the middle one: the parabola's top, less
     what it is off for a tone without a window."""
     true = np.linspace(-0.3, 0.3, 61)
-    top = _vertex(*(np.sinc(true - i / 2) ** 2 for i in (-1, 0, 1)))
-    return np.interp(_vertex(before, peak, after), top, true)
+    top = vertex(*(np.sinc(true - i / 2) ** 2 for i in (-1, 0, 1)))
+    return np.interp(vertex(before, peak, after), top, true)
 
 
 def _weights(direction: np.ndarray, antennas: Antennas, waveform: Waveform) -> np.ndarray:
