@@ -352,6 +352,11 @@ OF_CASES = {
         "np.exp(-1j * y[..., None] * self.nodes)",
         "np.exp(-1.05j * y[..., None] * self.nodes)",
     ),
+    "what opaque blades take": Bug(
+        "extensions/street/screening.py",
+        "(outer - inner) / (-1j * np.pi * u)",
+        "outer / (-1j * np.pi * u)",
+    ),
     "cross section of a vehicle and an agv": Bug(
         "extensions/street/extent.py",
         "Lobe(180.0, 36.32, 79.65, 36.73, 14.56, 7.50)",

@@ -266,7 +266,7 @@ class Rotors(Node):
     of a plastic edge, or along the normal of a plastic plate (docs/moving.md)."""
     chord_m: Annotated[float, Field(gt=0, le=0.3)] | None = None
     """Width of a blade as a flat plate [m], such as 0.015 of the default blades; it matters near
-    the blades' normals, above and below the rotors. null, the default: a thin wire."""
+    the blades' normals, and before a terminal's own arrays. null, the default: a thin wire."""
     incidence_deg: Annotated[float, Field(ge=-45, le=45)] = 10.0
     """Angle by which a flat blade's leading edge is above its trailing edge [degrees]. The default
     is that of a propeller with a pitch of 4 inches at three quarters of 12 cm."""

@@ -16,6 +16,7 @@ from isac_rt.extensions.street.rotors import (
     blade_section,
     blades_of,
 )
+from isac_rt.extensions.street.screening import FAR, squares_of
 from isac_rt.frame.antennas import Antennas, Arrays
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet, make_paths
@@ -139,6 +140,73 @@ def flat_blade_of_points() -> Errors:
         obliquity = (abs(normal @ u1) + abs(normal @ u2)) / 2
         truth = obliquity * np.sinc(x / np.pi) * np.exp(-1j * x) * np.sinc(y / np.pi)
         yield float(abs(found / np.sqrt(blade_section(rotors, k)) - truth))
+
+
+OPAQUE = Rotors(
+    number=2,
+    chord_m=0.015,
+    height_m=0.1,
+    rev_per_min=(6000.0, -5600.0),
+    phase_deg=(20.0, 75.0),
+)
+
+
+def surface(rotors: Rotors, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places (K, 3) on all flat blades at a time, normals (K, 3) and areas (K,), in body axes."""
+    places, normals = [], []
+    r, tilt, chord = rotors, np.radians(rotors.incidence_deg), rotors.chord_m or 0.0
+    (length, of_length), (width, of_width) = map(np.polynomial.legendre.leggauss, (180, 32))
+    length, width = (1 + length) / 2 * r.blade_length_m, width / 2 * chord
+    area = np.multiply.outer(of_length, of_width).ravel() / 4 * r.blade_length_m * chord
+    up = np.array([0.0, 0.0, 1.0])
+    for i, (speed, phase) in enumerate(zip(r.speeds, r.phase_deg or (), strict=True)):
+        where = 2 * np.pi * (i + 0.5) / r.number
+        hub = r.height_m * up + r.arm_m * _towards(where, 0.0) * (r.number > 1)
+        for blade in range(r.blades):
+            angle = np.radians(phase + 6 * speed * time) + 2 * np.pi * blade / r.blades
+            out = _towards(angle, 0.0)
+            ahead = np.sign(speed) * _towards(angle + np.pi / 2, 0.0)
+            across = np.cos(tilt) * ahead + np.sin(tilt) * up
+            spot = hub + length[:, None, None] * out + width[:, None] * across
+            places.append(spot.reshape(-1, 3))
+            normals.append(np.broadcast_to(np.cross(out, across), places[-1].shape))
+    return np.concatenate(places), np.concatenate(normals), np.tile(area, len(places))
+
+
+def kirchhoff(
+    blades: tuple[np.ndarray, np.ndarray, np.ndarray],
+    near: np.ndarray,
+    far: np.ndarray,
+    wavelength: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of places on a surface in what it takes of a wave between two ends, over j, and how
+    much longer the ways over them are [m]."""
+    (spot, normal, area), span = blades, np.linalg.norm(far - near)
+    r1, r2 = np.linalg.norm(spot - near, axis=1), np.linalg.norm(far - spot, axis=1)
+    first = ((spot - near) * normal).sum(axis=1) / r1
+    second = ((far - spot) * normal).sum(axis=1) / r2
+    weight = np.sign(first) * (first + second) / 2 * span / (r1 * r2) * area / wavelength
+    return weight, r1 + r2 - span
+
+
+@case(
+    "Kirchhoff's integral over the blades as a sum in float64",
+    "1e-3 of the wave, of which they take up to 0.4",
+    "integration by parts along the blade, which is cut after its first term",
+)
+def what_opaque_blades_take() -> Errors:
+    """Opaque blades over and under the arrays, from all elevations, from near and far."""
+    for height, distance in itertools.product((0.1, -0.1), (2.0, FAR)):
+        rotors = OPAQUE.model_copy(update={"height_m": height})
+        body = blades_of(rotors, Waveform(num_chirps=6), 1, "U")
+        assert isinstance(body, Plates)
+        k, times = body.wave_number, np.array([0.0, 0.0013, 0.0042])
+        for elevation in np.radians((-60, -25, 0, 8, 25, 90)):
+            far = distance * _towards(np.radians(80), elevation)
+            found = squares_of(body, far, times)[0].sum(axis=1)
+            for time, one in zip(times, found, strict=True):
+                weight, longer = kirchhoff(surface(rotors, time), np.zeros(3), far, 2 * np.pi / k)
+                yield abs(one - 1j * (weight * np.exp(-1j * k * longer)).sum())
 
 
 def _towards(azimuth: float, elevation: float) -> np.ndarray:

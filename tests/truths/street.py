@@ -92,7 +92,8 @@ def echoes_of_rain() -> Errors:
     for near, far in ((4, 10), (10, 20), (40, 80)):
         ranges = [p.delay * SPEED_OF_LIGHT / 2 for p in found]
         power = [p.power[(r > near) & (r < far)].sum() for p, r in zip(found, ranges, strict=True)]
-        integral = free.wavelength**2 * 4 * weather.drops.reflectivity * (1 / near - 1 / far)
+        per_metre = weather.drops.density @ weather.drops.backscatter
+        integral = free.wavelength**2 * 4 * per_metre * (1 / near - 1 / far)
         yield abs(np.mean(power) / (integral / (16 * np.pi**2)) - 1)
 
 

@@ -1,13 +1,7 @@
 r"""Specific attenuation of air [1]_ and of rain [2]_.
 
-Gas, with f in GHz, theta = 300 K / T, and the pressures p of dry air and e of water vapour in hPa:
-
-.. math::
-
-    \gamma = 0.1820\, f \left(\sum_i S_i F_i + N_D(f)\right)
-
-with the sum over 44 lines of oxygen and 35 of water vapour (S: strength, F: shape with its width
-and interference) and the continuum N_D of dry air. Rain of R mm/h: gamma = k R^alpha.
+Gas: the sum over 44 lines of oxygen and 35 of water vapour (strength times shape, with its width
+and interference) and the continuum of dry air. Rain of R mm/h: gamma = k R^alpha.
 
 References
 ----------

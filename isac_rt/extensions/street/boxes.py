@@ -3,7 +3,6 @@ faces."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -76,20 +75,17 @@ class Boxes:
         out, boxes = {}, self._boxes(poses, epoch)
         mirrors = Mirrors(boxes, self._free, self._occlusion, self._half_frame)
         for link, paths in found.items():
-            shadows = self._shadows(paths, poses, boxes)
-            mirrored = (
-                mirrors.between_terminals(shadows.state),
-                mirrors.echoes(shadows.state, poses),
-            )
-            lit = merge([paths, *itertools.chain(*mirrored)])
+            shadows = self.shadows(paths, poses, boxes)
+            echoes = mirrors.echoes(shadows.state, poses)
+            lit = merge([paths, *mirrors.between_terminals(shadows.state), *echoes])
             out[link] = replace(lit, gain=lit.gain * shadows.factor(lit))
         return Traced(out, dropped)
 
-    def shadows(self, paths: PathSet, poses: dict[str, Pose]) -> Shadows:
-        """Return the shadows on a link's paths at their epoch."""
-        return self._shadows(paths, poses, self._boxes(poses, paths.epoch))
-
-    def _shadows(self, paths: PathSet, poses: dict[str, Pose], boxes: list[Box]) -> Shadows:
+    def shadows(
+        self, paths: PathSet, poses: dict[str, Pose], boxes: list[Box] | None = None
+    ) -> Shadows:
+        """Return the shadows on a link's paths at their epoch, of the boxes at that time."""
+        boxes = boxes or self._boxes(poses, paths.epoch)
         (tx, rx), names = paths.link, paths.target_names
         state = LinkState(paths.link, paths.epoch, poses[tx], poses[rx], names)
         return Shadows(boxes, state, poses, self._free.wavelength, self._half_frame)

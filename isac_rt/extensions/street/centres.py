@@ -7,20 +7,15 @@ the ends of a link as the UAV sees them, over all walls of the path, U the UAV a
 .. math:: \delta(t) = \big(|T'-C| - |T'-U| + |R'-C| - |R'-U|\big)/c
 
 which is exact for mirrors. It is cut into pieces of whole slots, each a polynomial of the second
-order about its middle. The remainder in delay is at most :math:`|\dddot\tau| h^3/6` at h from it:
-:math:`2 v\Omega^2 h^3/(6 c)` for a point that circles at speed v and angular rate :math:`\Omega`,
-1e-15 s or 5e-4 rad for 75 m/s, 6000 rev/min and h = 32 us (`remainder`). Pieces are as long as
-`PHASE_ERROR` allows, a slot at least.
-
-Directions and radii at both ends follow the centre from piece to piece; so does spherical
-spreading. The elements' pattern, reflection and occlusion are those of the UAV's path, and edges
-round which a path bends move with the UAV. Copies are made after the plan's choice of paths and
-before synthesis: what scores and draws paths sees the UAV's own, and stored paths stay small.
+order about its middle, as long as `PHASE_ERROR` allows (`remainder`), a slot at least. Directions
+and radii at both ends follow the centre from piece to piece; so does spherical spreading. The
+elements' pattern, reflection and occlusion are those of the UAV's path. Copies are made after the
+plan's choice of paths and before synthesis: what scores and draws paths sees the UAV's own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -29,7 +24,8 @@ from scipy.spatial.transform import Rotation
 
 from isac_rt.extensions.street.extent import fixed_of
 from isac_rt.extensions.street.motion import PHASE_ERROR, CentreModel, Motion, pieces
-from isac_rt.extensions.street.rotors import Blades, as_wires, blades_of
+from isac_rt.extensions.street.rotors import Blades, Plates, blades_of
+from isac_rt.extensions.street.screening import FAR, squares_of
 from isac_rt.extensions.street.walker import walker_of_flight
 from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.link import Link
@@ -42,6 +38,8 @@ from isac_rt.world.swarm import Pose, Swarm, turned
 GRAVITY = np.array([0.0, 0.0, 9.81])  # what a hovering UAV's thrust bears [m/s^2]
 LEAST_THRUST = 0.1
 """Acceleration of thrust [m/s^2] below which the body's Z axis is left upright: it falls freely."""
+PROBES = 4
+"""Instants of a frame at which a path is asked whether blades matter to it."""
 
 
 def moving_centres(
@@ -61,7 +59,10 @@ def moving_centres(
             models.append((name, fixed_of(uav.extent, seed, name)))
         if uav.rotors is not None:
             models.append((name, blades_of(uav.rotors, waveform, seed, name)))
-            own[name] = blades_of(as_wires(uav.rotors), waveform, seed, name)
+            # a stated level of plates is that along their normal, and none of their edges
+            edges = {"chord_m": None, "blade_dbsm": None} if uav.rotors.chord_m else {}
+            wires = uav.rotors.model_copy(update=edges)
+            own[name] = blades_of(wires, waveform, seed, name)
     return MovingCentres(swarm, sections, waveform, arrays, models, own)
 
 
@@ -103,29 +104,82 @@ class MovingCentres:
         """
         target = _echoing(paths)
         gives_way = [name for name, model in self.models if model.replaces_echo]
-        parts = [paths.select(~np.isin(target, gives_way))]
-        later = middle - paths.epoch
+        kept, later = paths.select(~np.isin(target, gives_way)), middle - paths.epoch
+        parts = [kept, *self._over_blades(kept, poses, later, least_power)]
         for name, model in self.models:
             of = name, model, self._attitude(name, paths.epoch)
             least = 0.0 if model.replaces_echo else least_power
             bases = [b for b in self._bases(paths, target == name, poses, of) if b.power > least]
             if bases:
-                slots = self._slots_of_piece(paths, poses, of)
+                slots = 1 if self._screens(paths.link) else self._slots_of_piece(paths, poses, of)
                 begin, time = pieces(self.waveform, slots, later)
                 offset = of[2].turned(model.motion(paths.epoch + time), time)
                 faded = np.ones((len(bases), time.size))
                 if shadow is not None:
-                    row = np.repeat([base.row for base in bases], time.size)
-                    faded = shadow(paths.select(row), np.tile(time, len(bases))).reshape(
-                        faded.shape
-                    )
+                    each = paths.select(np.repeat([base.row for base in bases], time.size))
+                    faded = shadow(each, np.tile(time, len(bases))).reshape(faded.shape)
+                faded = faded * [self.passed(base.path, time) for base in bases]
                 for base, fade in zip(bases, faded, strict=True):
                     amplitudes = model.amplitudes(*base.towards, paths.epoch + time)
                     parts.append(_copies(base, amplitudes * fade[:, None], offset, begin, time))
         own = self.own_echoes(paths, poses, later)
         if own is not None and (own.power.sum() > least_power * self.waveform.num_chirps):
             parts.append(own)
-        return merge(parts) if len(parts) > 1 else paths
+        return merge(parts) if len(parts) > 1 else kept
+
+    def _screens(self, link: Link) -> dict[str, Plates]:
+        """Return the blades of a link's terminals that hide what is behind them from its arrays."""
+        return {n: blades for n, blades in self.models if n in link and isinstance(blades, Plates)}
+
+    def _taken(
+        self, path: PathSet, time: np.ndarray
+    ) -> Iterator[tuple[str, np.ndarray, np.ndarray, Motion]]:
+        """Yield each end of one path, tx or rx, whose own blades pass before its arrays: the place
+        (3,) to or from which it runs there, the parts (T, K) of it that squares of these take, and
+        their motion, in world axes from the arrays. The leakage stays on its board."""
+        screens = self._screens(path.link)
+        found: tuple[np.ndarray, np.ndarray, Motion] | None = None
+        ends = ("tx", path.departure, path.tx_radius), ("rx", path.arrival, path.rx_radius)
+        for end, towards, radius in ends if path.kind[0] != PathKind.LEAKAGE else ():
+            name, far = getattr(path, end), min(radius[0], FAR) * towards[0]
+            if name in screens:
+                if not (path.link.own and found and (far == found[0]).all()):
+                    axes = body_axes(self.swarm, name, path.epoch)
+                    share, squares = squares_of(screens[name], far @ axes, path.epoch + time)
+                    found = far, share, Motion(*(m @ axes.T for m in squares))
+                yield end, *found
+
+    def passed(self, path: PathSet, time: np.ndarray) -> np.ndarray:
+        """Return the part (T,) of one path that the terminals' own blades leave in the middle of
+        their arrays, at times (T,) [s since the epoch]."""
+        left = [1 - share.sum(axis=1) for _, _, share, _ in self._taken(path, time)]
+        return np.prod([np.ones(time.size), *left], axis=0)
+
+    def _over_blades(
+        self, paths: PathSet, poses: Mapping[str, Pose], later: float, least: float
+    ) -> Iterator[PathSet]:
+        """Yield waves over squares of the terminals' own blades, slot by slot, that take from a
+        link's paths what these hide, where that exceeds a power |gain|^2 together."""
+        begin, time = pieces(self.waveform, 1, later)
+        probes, screens = time[:: max(time.size // PROBES, 1)], self._screens(paths.link)
+        for row in np.flatnonzero(paths.power > least) if screens else ():
+            path = paths.select(np.array([row]))
+            if np.abs(self.passed(path, probes) - 1).max() ** 2 * path.power[0] <= least:
+                continue
+            left = path.gain * np.ones((time.size, 1))
+            for end, far, share, squares in self._taken(path, time):
+                name, way = getattr(path, end), {"tx": "departure", "rx": "arrival"}[end]
+                ways = squares.length(), squares._replace(place=squares.place - far).length()
+                longer, rate, accel = (a + b for a, b in zip(*ways, strict=True))
+                longer -= np.linalg.norm(far)
+                towards = squares.place / ways[0][0][..., None]
+                gain, to_body = self.arrays.of(name).element_gain, poses[name].to_body
+                pattern = gain(to_body(towards)) / gain(to_body(getattr(path, way)))
+                phase = np.exp(1j * screens[name].wave_number * longer)
+                columns = {"gain": -left * share * phase * np.sqrt(pattern), way: towards}
+                columns |= {"delay": longer, "delay_rate": rate, "delay_accel": accel}
+                yield _pieces(path, columns | {f"{end}_radius": ways[0][0]}, begin, time)
+                left = left * (1 - share.sum(axis=1, keepdims=True))
 
     def _bases(
         self,
@@ -150,18 +204,14 @@ class MovingCentres:
 
     def own_echoes(self, paths: PathSet, poses: Mapping[str, Pose], later: float) -> PathSet | None:
         """Return the echoes of a radar's own blades, slot by slot, the middle of the frame `later`
-        [s] than the epoch; None without.
-
-        Each point of a blade at r from the arrays has the delay 2 r/c, the spherical wavefronts of
-        r, and the amplitude of the radar equation: the points are a fraction of a wavelength long.
-        """
+        [s] than the epoch; None without."""
         if not paths.link.own or paths.tx not in self.own:
             return None
         name, model = paths.tx, self.own[paths.tx]
         begin, time = pieces(self.waveform, 1, later)
         axes = body_axes(self.swarm, name, paths.epoch)
         motion = Motion(*(m @ axes.T for m in model.motion(paths.epoch + time)))
-        distance, rate, accel = _distance(motion)
+        distance, rate, accel = motion.length()
         towards = motion.place / distance[..., None]
         section, wavelength = model.amplitude**2, self.waveform.wavelength
         columns = {
@@ -176,10 +226,17 @@ class MovingCentres:
         received = columns["gain"].any(axis=0)
         if not received.any():
             return None
-        about: dict[str, Any] = {"epoch": paths.epoch, "target_names": paths.target_names}
-        about |= {"kind": PathKind.LEAKAGE, "gain": [1.0], "delay": [0.0]}
-        about |= {"departure": [axes[1]], "arrival": [axes[1]]}
-        at_arrays = make_paths(tx=name, rx=name, **about)
+        at_arrays = make_paths(
+            tx=name,
+            rx=name,
+            epoch=paths.epoch,
+            target_names=paths.target_names,
+            kind=PathKind.LEAKAGE,
+            gain=[1.0],
+            delay=[0.0],
+            departure=towards[0, :1],
+            arrival=towards[0, :1],
+        )
         return _pieces(at_arrays, columns, begin, time).select(np.tile(received, time.size))
 
     def report(
@@ -196,55 +253,60 @@ class MovingCentres:
         """
         w, out = self.waveform, []
         slot = w.chirp_duration + (w.num_groups - 1) * w.group_spacing - w.window_start
-        frequency = w.carrier_frequency + w.bandwidth
+        k = 2 * np.pi * (w.carrier_frequency + w.bandwidth) / SPEED_OF_LIGHT
         for name, model in self.models:
-            most, parts, half = 0.0, model.described(), slot / 2
+            most, slots = 0.0, 1
             for link, paths in found.items():
-                which = _echoing(paths) == name
                 of = name, model, self._attitude(name, paths.epoch)
-                for base in self._bases(paths, which, poses, of):
-                    power = base.power * over_noise[link]
-                    if power > most:
-                        most, parts = power, model.described(*base.towards)
-                        beyond = (self._slots_of_piece(paths, poses, of) - 1) * w.slot_duration
-                        half = (slot + beyond) / 2
+                for base in self._bases(paths, _echoing(paths) == name, poses, of):
+                    if (power := base.power * over_noise[link]) > most:
+                        most, slots = power, self._slots_of_piece(paths, poses, of)
+            half = (slot + (slots - 1) * w.slot_duration) / 2
             if not most and Link(name, name) in found and name in self.own:
                 continue
-            error = 2 * np.pi * frequency * remainder(model.jerk, half) + model.fading * half
-            left_out = "jerk, turning and obliquity within pieces of the frame"
-            row = self._row(parts, model.speed, most, left_out, max(PHASE_ERROR, error))
-            out.append({"what": f"moving parts of {name}", **row})
+            error = k * SPEED_OF_LIGHT * remainder(model.jerk, half) + model.fading * half
+            error = max(PHASE_ERROR, error)
+            about = f"moving parts of {name}", "jerk, turning, obliquity within pieces", error
+            out.append(self._row(about, model, most))
         for link, paths in found.items():
+            antennas, placed = self.arrays.at(link), np.flatnonzero(paths.kind != PathKind.LEAKAGE)
+            ends = antennas.rx_positions, antennas.tx_positions
+            reach = sum(float(np.linalg.norm(end, axis=1).max()) for end in ends)
+            before = [blades.rotors for blades in self._screens(link).values()]
+            if before and placed.size:
+                strongest = placed[[paths.power[placed].argmax()]]
+                left = self.passed(paths.select(strongest), pieces(w, 1, 0.0)[1])
+                lines = float(left.std() / np.abs(left.mean()))
+                row = {"what": "opaque blades before the arrays", "link": str(link)}
+                row["modelled"] = f"lines of {20 * np.log10(lines):.0f} dB on the strongest path"
+                row["left_out"] = "sizes of squares as antennas beside the arrays' middle see them"
+                error = lines * k * reach * max((r.chord_m or 0) / 4 / r.nearest for r in before)
+                out.append({**row, "estimate": error, "unit": "of a path's amplitude"})
             own = self.own_echoes(paths, poses, 0.0)
             if own is not None:
                 blades, gain = self.own[link.tx], own.gain.real.reshape(w.num_chirps, -1)
                 mean = float(own.power.sum()) / w.num_chirps * over_noise[link]
-                antennas = self.arrays.of(link.tx)
-                ends = antennas.rx_positions, antennas.tx_positions
-                reach = sum(float(np.linalg.norm(end, axis=1).max()) for end in ends)
-                turn = blades.speed / own.rx_radius.min() * slot / 2
-                error = 2 * np.pi * frequency / SPEED_OF_LIGHT * reach * turn
+                error = k * reach * blades.speed / own.rx_radius.min() * slot / 2
                 # the other change of a slot is in gain: by spreading and the elements' pattern
-                error += np.linalg.norm(np.diff(gain, axis=0)) / np.linalg.norm(gain) / 2
-                left_out = "directions and ranges within a slot"
-                row = self._row(blades.described(), blades.speed, mean, left_out, float(error))
-                out.append({"what": f"own rotors of {link.tx}", **row})
+                error += float(np.linalg.norm(np.diff(gain, axis=0)) / np.linalg.norm(gain) / 2)
+                about = f"own rotors of {link.tx}", "directions and ranges within a slot", error
+                out.append(self._row(about, blades, mean))
         return out
 
     def _row(
-        self, parts: str, speed: float, power: float, left_out: str, error: float
+        self, about: tuple[str, str, float], model: CentreModel, power: float
     ) -> dict[str, Any]:
-        """Return what the plan says of moving parts, by their speed [m/s], their power over the
-        noise of a cell and the error of what is left out [rad]."""
-        edge, widest = 2 * speed / self.waveform.wavelength, 1 / (2 * self.waveform.slot_duration)
+        """Return what the plan says of moving parts: what they are, what is left out and its error
+        [rad], and their power over the noise of a cell."""
+        w, edge = self.waveform, 2 * model.speed / self.waveform.wavelength
         seen = "without effect: no terminal receives its echo"
         if power > 0:
             seen = (
                 f"{10 * np.log10(power):.0f} dB over the noise of a cell; Doppler to {edge:.4g} Hz "
-                f"either side, slots show {widest:.4g} Hz"
+                f"either side, slots show {1 / (2 * w.slot_duration):.4g} Hz"
             )
-        row = {"modelled": f"{parts}, {seen}", "left_out": left_out}
-        return {**row, "estimate": error, "unit": "rad"}
+        row = dict(zip(("what", "left_out", "estimate"), about, strict=True))
+        return {**row, "modelled": f"{model.described()}, {seen}", "unit": "rad"}
 
     def _slots_of_piece(
         self,
@@ -264,9 +326,8 @@ class MovingCentres:
         places = model.motion(np.array([paths.epoch])).place
         extent = float(np.linalg.norm(places, axis=-1).max())
         spin, turning, fastest = float(np.linalg.norm(attitude.rate)), 0.0, 0.0
-        for end, elements in zip(
-            paths.link, (antennas.tx_positions, antennas.rx_positions), strict=True
-        ):
+        arrays = antennas.tx_positions, antennas.rx_positions
+        for end, elements in zip(paths.link, arrays, strict=True):
             distance = float(np.linalg.norm(uav.position - poses[end].position))
             passing = float(np.linalg.norm(uav.velocity - poses[end].velocity))
             reach = float(np.linalg.norm(elements, axis=1).max())
@@ -409,7 +470,12 @@ def _pieces(
         columns[name] = getattr(path, name) + columns[name] / SPEED_OF_LIGHT
     columns["begin"] = np.broadcast_to(np.maximum(begin[:-1, None], path.begin), rate.shape)
     columns["end"] = np.broadcast_to(np.minimum(begin[1:, None], path.end), rate.shape)
-    flat: dict[str, Any] = {k: v.reshape(-1, *v.shape[2:]) for k, v in columns.items()}
+    for name in ("departure", "arrival", "tx_radius", "rx_radius"):
+        columns.setdefault(name, getattr(path, name)[None])
+    flat: dict[str, Any] = {
+        k: np.broadcast_to(v, (*rate.shape, *v.shape[2:])).reshape(-1, *v.shape[2:])
+        for k, v in columns.items()
+    }
     same: dict[str, Any] = {k: getattr(path, k)[0] for k in ("kind", "target", "bounces")}
     (tx, rx), names = path.link, path.target_names
     return make_paths(tx=tx, rx=rx, epoch=path.epoch, target_names=names, **same, **flat)
@@ -472,21 +538,12 @@ def segment(image: EndImage, time: np.ndarray, offset: Motion) -> Segment:
         np.broadcast_to(acceleration, (time.size, 1, 3)),
     )
     centre = Motion(*(u - o for u, o in zip(uav, offset, strict=True)))
-    of_uav, of_centre = _distance(uav), _distance(centre)
+    of_uav, of_centre = uav.length(), centre.length()
     rho, q = offset.place, uav.place
     longer = np.vecdot(rho, rho - 2 * q) / (of_centre[0] + of_uav[0])
     rate, accel = (a - b for a, b in zip(of_centre[1:], of_uav[1:], strict=True))
     turn = image.towards - centre.place / of_centre[0][..., None]
     return Segment(of_centre[0], longer, rate, accel, of_uav[0] / of_centre[0], turn)
-
-
-def _distance(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the length of a vector that moves, and its first and second derivative."""
-    place, velocity, acceleration = motion
-    length = np.sqrt(np.vecdot(place, place))
-    rate = np.vecdot(place, velocity) / length
-    accel = np.vecdot(velocity, velocity) + np.vecdot(place, acceleration) - rate * rate
-    return length, rate, accel / length
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -1,11 +1,7 @@
-r"""CFAR that knows combs: the lines of rotors, folded by the slots, fill all velocities of a UAV's
-range cells.
-
-The greatest-of CFAR compares a cell with the range cells before and behind it, where the comb is
-not. Here the background is at least the median over all velocities of the cell's own range,
-which a few targets do not move. Of Gamma(L)/L, the power of L channels in noise, the median is m
-and the mean 1: the median over m estimates the mean of noise and comb, and the factor of the
-false-alarm rate holds as for noise.
+"""CFAR that knows combs: the lines of rotors, folded by the slots, fill all velocities of a UAV's
+range cells. The background is at least the median over these, which a few targets do not move. Of
+Gamma(L)/L, the power of L channels in noise, the mean is 1: the median of the cells over that of
+the distribution estimates it, and the factor of the false-alarm rate holds as for noise.
 """
 
 from __future__ import annotations

@@ -3,8 +3,7 @@ r"""Raindrops: how many there are of each size, how fast they fall, and what the
 Diameters D follow Marshall and Palmer [1]_, :math:`N(D) \propto e^{-\Lambda D}` with Lambda = 4.1
 R^-0.21 per mm, scaled so that drops which fall at Atlas' speed [2]_, 9.65 - 10.3 exp(-0.6 D) m/s,
 carry the stated rain rate R [mm/h]. Each is a sphere of water (permittivity of ITU-R P.840), whose
-scattering is Mie's series [3]_: at 77 GHz a drop of 1.2 mm is a wavelength round, and Rayleigh's
-law would be 12 dB too high at 10 mm/h.
+scattering is Mie's series [3]_: at 77 GHz a drop of 1.2 mm is a wavelength round.
 
 References
 ----------
@@ -142,11 +141,6 @@ class Drops:
     def backscatter(self) -> np.ndarray:
         """(D,) radar cross-section of a drop of each class [m^2]."""
         return np.asarray(4 * np.pi / self._wave_number**2 * abs(self.amplitudes[0, :, -1]) ** 2)
-
-    @property
-    def reflectivity(self) -> float:
-        """Radar cross-section of a cubic metre [1/m]."""
-        return float(self.density @ self.backscatter)
 
     def cross_sections(
         self, classes: np.ndarray, along: np.ndarray, onward: np.ndarray

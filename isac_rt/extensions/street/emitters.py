@@ -1,4 +1,4 @@
-r"""Foreign FMCW radars: their chirps where they cross the IF band of a receiver.
+r"""Foreign FMCW radars: their chirps where they cross the IF band of a receiver (docs/weather.md).
 
 The IF signal is the receiver's reference chirp times the conjugate of what arrives. With u the time
 since the start of the reference chirp and v = (1 - r) u - a that since the start of the foreign one
@@ -8,16 +8,11 @@ in cycles is quadratic in u,
 .. math:: f_c u + \tfrac12\alpha u^2 - f_e v - \tfrac12\alpha_e v^2
    = \varphi_0 + f_0 u + \tfrac12\kappa u^2,
 
-so the foreign chirp is a chirp of slope kappa in the IF, alpha - alpha_e to 1e-7. Its spectrum over
-the time in which both chirps last is a difference of Fresnel integrals. Times the filter's gain and
-transformed back at the rate of the samples, it gives them with the filter's transients at both
-edges of the band; a crossing of 1 us is shorter than the filter's memory. Reference chirps last
-`MARGIN` transients longer than the samples on both sides; ends of foreign chirps far outside of the
-band leave no click.
-
-Chirps of one emitter begin with the same phase and are timed by its own clock, whose drift divides
-its frequencies and multiplies its times; it sends from one place with the pattern of one element.
-Paths are traced from it as from a terminal, with one bounce at most, and lose what weather takes.
+so the foreign chirp is one of slope kappa in the IF, whose spectrum over the time in which both
+last is a difference of Fresnel integrals. Reference chirps last `MARGIN` transients of the filter
+longer than the samples on both sides. Chirps of one emitter begin with the same phase and are timed
+by its own clock; it sends from one place with the pattern of one element. Paths are traced from it
+as from a terminal, with one bounce at most, and lose what weather takes.
 """
 
 from __future__ import annotations
@@ -93,10 +88,8 @@ class Train:
         offset = generator(seed, "emitter", name).uniform(0, repetition)
         if e.offset_us is not None:
             offset = e.offset_us * 1e-6
-        slope, interval = e.slope_mhz_per_us * 1e12, e.burst_interval_s or 0.0
-        return cls(
-            e.start_hz, slope, e.ramp_us * 1e-6, repetition, offset, e.burst_chirps, interval
-        )
+        times, interval = (e.ramp_us * 1e-6, repetition, offset), e.burst_interval_s or 0.0
+        return cls(e.start_hz, e.slope_mhz_per_us * 1e12, *times, e.burst_chirps, interval)
 
     def as_received(self, sender: Emitter, receiver: Uav) -> Train:
         """Return the chirps, which are timed by their sender's clock, on a receiver's clock."""
@@ -139,12 +132,12 @@ class Arrival:
     amplitude: float
     paths: PathSet
 
-    def strongest(self, noise: float) -> PathSet:
-        """Return the paths without the weakest, whose sum stays `WEAKEST` of the noise [W]."""
+    def strongest(self, noise: float) -> Arrival:
+        """Return the signal without its weakest paths, whose sum is `WEAKEST` of the noise [W]."""
         power = self.amplitude**2 * self.paths.power
         order = np.argsort(power)
         weak = order[np.cumsum(power[order]) <= WEAKEST * noise]
-        return self.paths.select(np.setdiff1d(np.arange(len(self.paths)), weak))
+        return replace(self, paths=self.paths.select(np.setdiff1d(np.arange(order.size), weak)))
 
 
 class Emitters:
@@ -152,11 +145,10 @@ class Emitters:
 
     def __init__(self, scenario: Scenario, city: CityMesh, waveform: Waveform) -> None:
         self._scenario, self._city, self._waveform = scenario, city, waveform
-        self._uavs = {name: e.uav() for name, e in scenario.emitters.items()}
+        each = scenario.emitters.items()
+        self._uavs = {name: e.uav() for name, e in each}
         self._flights = {name: Trajectory(uav) for name, uav in self._uavs.items()}
-        self._trains = {
-            name: Train.of(e, name, scenario.seed) for name, e in scenario.emitters.items()
-        }
+        self._trains = {name: Train.of(e, name, scenario.seed) for name, e in each}
         for name, flight in self._flights.items():
             place = flight.pose(0.0).position - city.origin
             if enclosed(city, place) and enclosed(obstacles(city, place[None]), place):
@@ -168,8 +160,7 @@ class Emitters:
     @cached_property
     def _model(self) -> Any:
         """Paths from emitters: another swarm, in which they are terminals."""
-        s = self._scenario
-        found = s.propagation
+        s, found = self._scenario, self._scenario.propagation
         bounces = {"max_bounces": min(found.max_bounces, 1), "ghosts": False}
         parts: dict[str, Any] = {
             "swarm": {**s.swarm, **self._uavs},
@@ -220,8 +211,7 @@ class WithForeign:
         """(M, L_rx, P, N) complex64."""
         out = self.method.samples(waveform, tones, noise)
         for arrival in self.arrivals:
-            some = replace(arrival, paths=arrival.strongest(self.level))
-            add_foreign(out, waveform, some, self.receiver, self.reference)
+            add_foreign(out, waveform, arrival.strongest(self.level), self.receiver, self.reference)
         return out
 
 
@@ -391,8 +381,7 @@ def plan_row(
     shape = waveform.num_groups, receiver.antennas.num_rx, waveform.num_chirps, waveform.num_samples
     foreign = np.zeros(shape, complex)
     for arrival in arrivals:
-        some = replace(arrival, paths=arrival.strongest(noise))
-        add_foreign(foreign, waveform, some, receiver, reference)
+        add_foreign(foreign, waveform, arrival.strongest(noise), receiver, reference)
     over = np.abs(foreign) ** 2 / noise
     rise, most = 10 * np.log10(1 + over.mean()), 10 * np.log10(over.max() + 1e-40)
     level = f"floor {rise:.2g} dB up: {100 * (over > 1).mean():.2g} % of the samples over the noise"

@@ -1,10 +1,9 @@
 """Detection and excision of foreign chirps in IF samples: short in time where echoes are narrow in
 frequency.
 
-Of each chirp's windowed spectrum the lines are set aside, bins over the median by a false alarm
-probability. What is left is transformed back, and samples whose power over all antennas exceeds the
-threshold of noise at the same probability lose it: echoes, leakage and data, which are lines, stay
-whole, so that a strong one leaves no gap that spreads over the map."""
+Each chirp's spectrum loses its lines, bins over the median by a false alarm probability. Of what is
+left samples are removed whose power over all antennas exceeds the threshold of noise at the same
+probability: lines stay whole, so that a strong one leaves no gap that spreads over the map."""
 
 from __future__ import annotations
 
@@ -17,8 +16,7 @@ from scipy.special import gammainccinv, gammaincinv
 from isac_rt.frame.cube import IFCube
 
 LEAST_WINDOW = 0.2
-"""Value of the window under which samples are left as they are, as receivers weigh them so little
-themselves."""
+"""Value of the window under which samples are left as they are: receivers weigh them so little."""
 
 
 def excised(cube: IFCube, rate: float) -> IFCube:

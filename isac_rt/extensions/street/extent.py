@@ -1,25 +1,21 @@
-r"""Scattering centres fixed on a target: 3GPP's with one on each face, or stated ones.
+"""Scattering centres fixed on a target: 3GPP's with one in the middle of each face, or stated ones.
 
 TR 38.901 (v19) clause 7.9.2.1 has lobes of a vehicle, an automated guided vehicle (AGV) and a large
 UAV, each a target of one point (tables -2, -4, -6). Its tables of several points (-5, -7) follow
-from these to 0.02 dB by a rule that is applied to all three here: the floors of n lobes add to that
-of the one point, and the peaks lose what the other floors add,
-
-.. math:: F' = F - 10\lg n, \qquad 10^{P'/10} = 10^{P/10} - (n-1)\,10^{F'/10}
-
-The random component of each centre is a smooth field over the aspect (`CrossSection`), so that the
-sum is coherent over frames. Centres lie in the middle of the faces.
+from these to 0.02 dB by a rule that is applied to all three here (docs/moving.md). The random
+component of each centre is a smooth field over the aspect (`CrossSection`), so that the sum is
+coherent over frames.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from isac_rt.extensions.street.motion import Motion
+from isac_rt.extensions.street.motion import CentreModel, Motion
 from isac_rt.extensions.street.walker import HUMAN_DBSM
 from isac_rt.propagation.rcs import (
     LARGE_BISTATIC,
@@ -75,7 +71,7 @@ KINDS = {
 
 
 @dataclass(frozen=True)
-class Fixed:
+class Fixed(CentreModel):
     """Centres that rest in a target's axes, and the cross-section of each.
 
     Attributes
@@ -87,19 +83,12 @@ class Fixed:
     sections: tuple[CrossSection, ...]
     phases: Mapping[int, tuple[AspectTable, AspectTable]] = field(default_factory=dict)
 
-    replaces_echo: ClassVar[bool] = True
-    speed: ClassVar[float] = 0.0
-    jerk: ClassVar[float] = 0.0
-    fading: ClassVar[float] = 0.0
-
-    def described(self, *towards: np.ndarray) -> str:
-        """Return the centres in words."""
+    def described(self) -> str:
         return f"{len(self.places)} scattering centres"
 
     def amplitudes(
         self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
     ) -> np.ndarray:
-        """(K,) square root of each centre's cross-section [m], with its phase."""
         each = [section.square_metres(incident, observed) for section in self.sections]
         out = np.sqrt(np.ravel(each)).astype(complex)
         total = incident + observed
@@ -110,11 +99,9 @@ class Fixed:
         return out
 
     def square_metres(self, incident: np.ndarray, observed: np.ndarray) -> Any:
-        """Return the cross-section (...) of all centres, added by power [m^2]."""
         return sum(section.square_metres(incident, observed) for section in self.sections)
 
     def motion(self, time: np.ndarray) -> Motion:
-        """Return the centres' places, at rest."""
         rest = np.zeros((time.size, *self.places.shape))
         return Motion(self.places + rest, rest, rest)
 

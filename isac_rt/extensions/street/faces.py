@@ -1,12 +1,9 @@
-r"""Paths over the faces of boxes that move: mirrors between terminals, and echoes of UAVs.
+"""Paths over the faces of boxes that move: mirrors between terminals, and echoes of UAVs.
 
-With n(t) the normal of a face at the height s over the box's middle p(t), an end E of a segment has
-the image :math:`E - 2hn`, :math:`h = n\cdot(E - p) - s`, from which the segment runs straight. The
-image's velocity and acceleration have the derivatives of h and n,
-:math:`\dot n = \omega\times n` and :math:`\ddot n = \dot\omega\times n + \omega\times\dot n`.
-A segment lives while both its ends stand before the face and the point of reflection is on it. The
-echo of a UAV has such a segment before it, after it or both, with the amplitude of the radar
-equation over both lengths.
+A segment over a face runs straight from an end's image, which moves with the face (docs/moving.md).
+It lives while both its ends stand before the face and the point of reflection is on it. The echo of
+a UAV has such a segment before it, after it or both, with the amplitude of the radar equation over
+both lengths.
 """
 
 from __future__ import annotations
@@ -21,7 +18,7 @@ import numpy as np
 
 from isac_rt.extensions.street.centres import Attitude
 from isac_rt.extensions.street.occlusion import Occlusion
-from isac_rt.extensions.street.solid import Solid
+from isac_rt.extensions.street.solid import TINY, Solid
 from isac_rt.propagation.free_space import FreeSpace, friis_amplitude, radar_amplitude
 from isac_rt.propagation.pathset import PathKind, PathSet
 from isac_rt.propagation.scatter_paths import LinkState, ScatterPaths
@@ -35,7 +32,6 @@ INSTANTS = 65
 """Instants of a frame between which a face is taken to come into view and go linearly."""
 FIRST_BOX = -2
 """Number that stands for the face of the first UAV's box in `PathSet.faces`; others count down."""
-TINY = np.finfo(float).tiny
 
 
 class Box(NamedTuple):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -19,46 +20,59 @@ class Motion(NamedTuple):
     velocity: np.ndarray
     acceleration: np.ndarray
 
+    def length(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the distance from the origin, and its first and second derivative."""
+        place, velocity, acceleration = self
+        length = np.sqrt(np.vecdot(place, place))
+        rate = np.vecdot(place, velocity) / length
+        accel = np.vecdot(velocity, velocity) + np.vecdot(place, acceleration) - rate * rate
+        return length, rate, accel / length
 
-class CentreModel(Protocol):
+
+class CentreModel(ABC):
     """Scattering centres that move in the axes of a UAV's body (right, ahead, up).
 
     Attributes
     ----------
+    amplitude : (K,) square root of each centre's cross-section [m], with its phase
     speed, jerk : largest of all centres against the body [m/s, m/s^3]
     fading : largest rate at which amplitudes change [1/s of the largest]
     replaces_echo : the UAV's own point echo is left out
     """
 
-    replaces_echo: ClassVar[bool]
+    amplitude: np.ndarray
+    replaces_echo: ClassVar[bool] = True
 
     @property
-    def speed(self) -> float: ...
+    def speed(self) -> float:
+        return 0.0
 
     @property
-    def jerk(self) -> float: ...
+    def jerk(self) -> float:
+        return 0.0
 
     @property
-    def fading(self) -> float: ...
+    def fading(self) -> float:
+        return 0.0
 
-    def described(self, *towards: np.ndarray) -> str:
-        """Return what is modelled, in words for the plan, as seen from directions (3,)."""
-        ...
+    @abstractmethod
+    def described(self) -> str:
+        """Return what is modelled, in words for the plan."""
 
     def amplitudes(
         self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
     ) -> np.ndarray:
         """(K,) square root of each centre's cross-section [m] towards source and observer, unit
         vectors (3,) in the body's axes; (T, K) where it changes with time (T,) [s]."""
-        ...
+        return self.amplitude
 
     def square_metres(self, incident: np.ndarray, observed: np.ndarray) -> Any:
         """Return the cross-section of all centres, added by power and over time [m^2]."""
-        ...
+        return (np.abs(self.amplitude) ** 2).sum()
 
+    @abstractmethod
     def motion(self, time: np.ndarray) -> Motion:
         """Return the centres' motion from the UAV's position at times (T,) [s]."""
-        ...
 
 
 def pieces(w: Waveform, slots: int, later: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,45 +1,27 @@
 r"""Blades of rotors as scattering centres: sums of points that equal the integral over the blade.
 
-A blade is a thin wire or, with a chord, a flat plate. The wire is of uniform cross-section per
-length from the hub to the tip. Its amplitude towards bistatic directions with the sum
-:math:`s = u_1 + u_2`, for a wave number k and the blade's direction e, is the closed form
-(V. C. Chen, The Micro-Doppler Effect in Radar, chapter 3)
+A blade is a thin wire or, with a chord, a flat plate (docs/moving.md has formulas and sources). The
+integral along it is summed by Gauss-Legendre quadrature: with N points it leaves out at most
+:math:`\sum_{n\ge 2N}(2n+1)|j_n(kL)|` of a flash, since the points integrate polynomials of degrees
+below 2N exactly and the Legendre coefficients of :math:`e^{jax}` are :math:`(2n+1)j^nj_n(a)`. About
+one point each quarter of a wavelength leaves 1e-5.
 
-.. math:: \frac{\sqrt\sigma}{L}\int_0^L e^{jk r\,s\cdot e}dr = \sqrt\sigma\,\mathrm{sinc}(x/\pi)\,
-   e^{jx}, \qquad x = \tfrac12 k L\,s\cdot e
-
-A flash is broadside, x = 0, and has the cross-section sigma. The integral is summed by
-Gauss-Legendre quadrature: with N points it leaves out at most
-:math:`\sum_{n\ge 2N}(2n+1)|j_n(kL)|` of the flash, since the points integrate polynomials of
-degrees below 2N exactly and the Legendre coefficients of :math:`e^{jax}` are
-:math:`(2n+1)j^nj_n(a)`. About one point each quarter of a wavelength leaves 1e-5.
-
-A metal edge seen across its length L has :math:`\sigma = L^2/\pi` (E. F. Knott, Radar Cross
-Section, 2nd edition, section 6.3, the field along the edge); plastic with a permittivity of 3
-reflects 11.4 dB less (Fresnel).
-
-A flat plate of chord W along w, with the normal n, has the amplitude of physical optics
-
-.. math:: \frac{\sqrt{4\pi}LW}{\lambda}\,\frac{|n\cdot u_1|+|n\cdot u_2|}{2}\,
-   \mathrm{sinc}(x/\pi)\,e^{jx}\,\mathrm{sinc}(y/\pi), \qquad y = \tfrac12 k W\,s\cdot w
-
-The obliquity is the mean of :math:`|n\cdot u_1|` of a field across the plane of incidence and of
-:math:`|n\cdot u_2|` of one in it; from one place both are the same (Knott, section 5.2; Chen,
-section 3.3). The chord has a few points with exact delays. Near the direction in the middle of a
-piece their amplitudes give the integral over the chord: its phase is interpolated between them
-(Lagrange's polynomials at Gauss's nodes).
+The obliquity of a plate with the normal n is the mean of :math:`|n\cdot u_1|` of a field across the
+plane of incidence and of :math:`|n\cdot u_2|` of one in it; from one place both are the same. The
+chord has a few points with exact delays. Near the direction in the middle of a piece their
+amplitudes give the integral over the chord: its phase is interpolated between them.
 """
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from scipy.interpolate import BarycentricInterpolator
 from scipy.special import spherical_jn
 
-from isac_rt.extensions.street.motion import PHASE_ERROR, Motion
+from isac_rt.extensions.street.motion import PHASE_ERROR, CentreModel, Motion
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.randomness import generator
 from isac_rt.world.settings import Rotors
@@ -48,8 +30,6 @@ LEFT_OUT = 1e-5
 """Amplitude that the sum of points may miss of a flash."""
 CHORD_LEFT_OUT = 1e-3
 """Amplitude that the points of a chord may miss, a tenth of what pieces miss of the obliquity."""
-DARK = 1e-10
-"""Power of a plate over that of its edges from which on it is called dark."""
 ANGLES = 8
 """Angles of a blade in each lobe of its pattern at which mean powers are summed."""
 PLASTIC = ((np.sqrt(3.0) - 1) / (np.sqrt(3.0) + 1)) ** 2
@@ -57,7 +37,7 @@ PLASTIC = ((np.sqrt(3.0) - 1) / (np.sqrt(3.0) + 1)) ** 2
 
 
 @dataclass(frozen=True)
-class Blades:
+class Blades(CentreModel):
     """Points on the blades of a UAV's rotors.
 
     Attributes
@@ -78,38 +58,18 @@ class Blades:
     replaces_echo: ClassVar[bool] = False
 
     @property
-    def fading(self) -> float:
-        """Rate at which amplitudes change: none [1/s]."""
-        return 0.0
-
-    @property
     def speed(self) -> float:
-        """Speed of the fastest point [m/s]."""
         return float(np.abs(self.radius * self.turning).max())
 
     @property
     def jerk(self) -> float:
-        """Largest jerk of a point [m/s^3]."""
         return float(np.abs(self.radius * self.turning**3).max())
 
-    def described(self, *towards: np.ndarray) -> str:
-        """Return the blades in words."""
-        each = int((self.hub == self.hub[0]).all(axis=1).sum())
+    def described(self) -> str:
         ends = np.isclose(self.radius, self.radius.max()).sum()
-        return f"{self.radius.size // each} rotors, {ends} blades as {self.radius.size} points"
-
-    def amplitudes(
-        self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
-    ) -> np.ndarray:
-        """(K,) square root of each point's cross-section [m]."""
-        return self.amplitude
-
-    def square_metres(self, incident: np.ndarray, observed: np.ndarray) -> float:
-        """Return the cross-section of all points, added by power [m^2]."""
-        return float((self.amplitude**2).sum())
+        return f"{ends} blades as {self.radius.size} points"
 
     def motion(self, time: np.ndarray) -> Motion:
-        """Return the points' motion in the body's axes at times (T,) [s]."""
         angle = self.phase + self.turning * time[:, None]
         arm = np.zeros((*angle.shape, 3))
         arm[..., 0], arm[..., 1] = self.radius * np.sin(angle), self.radius * np.cos(angle)
@@ -139,37 +99,31 @@ class Plates(Blades):
     lead: np.ndarray
 
     @property
+    def hubs(self) -> np.ndarray:
+        """(N, 3) of each blade [m, body axes]."""
+        return self.hub.reshape(self.start.size, -1, 3).mean(axis=1)
+
+    @property
     def fading(self) -> float:
-        """Largest rate at which the obliquity changes [1/s]."""
         return float(np.abs(self.spin * np.sin(np.radians(self.rotors.incidence_deg))).max())
 
-    def described(self, *towards: np.ndarray) -> str:
-        """Return the blades in words."""
-        r, blades = self.rotors, self.start.size
-        out = f"{r.number} rotors, {blades} flat blades as {self.radius.size} points"
-        if not towards:
-            return out
-        lobes = self.wave_number * r.blade_length_m / np.pi
-        # mean of a sinc squared over a turn
-        edges = blades * blade_section(as_wires(r)) / (2 * lobes)
-        ratio = self.square_metres(*towards) / edges
-        return f"{out}, {10 * np.log10(max(ratio, DARK)):+.0f} dB against their edges as wires"
+    def described(self) -> str:
+        return f"{self.start.size} flat blades as {self.radius.size} points"
 
     def amplitudes(
         self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
     ) -> np.ndarray:
-        """(T, K) square root of each point's cross-section at times (T,) [s], with its phase."""
         angle = self.start + self.spin * time[:, None]
         obliquity, _, y = self._aspect(angle, incident, observed)
         place, weight = np.polynomial.legendre.leggauss(num_points(float(np.abs(y).max())))
-        share = weight / 2 * lagrange(self.nodes, place)
+        # Lagrange's polynomials of the nodes at the places
+        share = weight / 2 * BarycentricInterpolator(self.nodes, np.eye(self.nodes.size))(place).T
         chord = np.exp(1j * y[..., None] * place) @ share.T
         chord *= obliquity[..., None] * np.exp(-1j * y[..., None] * self.nodes)
         along = self.radius.size // (self.start.size * self.nodes.size)
         return np.asarray(self.amplitude * chord.reshape(time.size, -1).repeat(along, axis=1))
 
     def square_metres(self, incident: np.ndarray, observed: np.ndarray) -> float:
-        """Return the mean cross-section of all blades over a turn [m^2]."""
         lobes = int(4 * self.wave_number * self.rotors.blade_length_m / np.pi) + 1
         angle = np.linspace(0, 2 * np.pi, ANGLES * lobes, endpoint=False)
         obliquity, x, y = self._aspect(angle[:, None] + 0 * self.lead, incident, observed)
@@ -180,15 +134,20 @@ class Plates(Blades):
         self, angle: np.ndarray, incident: np.ndarray, observed: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return obliquity, x and y of blades at angles (..., N)."""
-        sine, cosine, r = np.sin(angle), np.cos(angle), self.rotors
-        flat, tilt = np.zeros_like(angle), np.radians(r.incidence_deg)
-        blade = np.stack([sine, cosine, flat], axis=-1)
-        ahead = np.stack([self.lead * cosine, -self.lead * sine, flat], axis=-1)
-        chord = np.cos(tilt) * ahead + np.sin(tilt) * np.array([0.0, 0.0, 1.0])
-        normal, both = np.cross(blade, chord), incident + observed
+        (blade, chord, normal), r, both = self.axes(angle), self.rotors, incident + observed
         obliquity = (np.abs(normal @ incident) + np.abs(normal @ observed)) / 2
         x, y = blade @ both * r.blade_length_m, chord @ both * (r.chord_m or 0.0)
         return obliquity, self.wave_number / 2 * x, self.wave_number / 2 * y
+
+    def axes(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return unit vectors (..., N, 3) along blades at angles (..., N), from their trailing to
+        their leading edges, and across both."""
+        sine, cosine = np.sin(angle), np.cos(angle)
+        flat, tilt = np.zeros_like(angle), np.radians(self.rotors.incidence_deg)
+        blade = np.stack([sine, cosine, flat], axis=-1)
+        ahead = np.stack([self.lead * cosine, -self.lead * sine, flat], axis=-1)
+        chord = np.cos(tilt) * ahead + np.sin(tilt) * np.array([0.0, 0.0, 1.0])
+        return blade, chord, np.cross(blade, chord)
 
 
 def blades_of(rotors: Rotors, waveform: Waveform, seed: int, name: str) -> Blades:
@@ -226,14 +185,6 @@ def blades_of(rotors: Rotors, waveform: Waveform, seed: int, name: str) -> Blade
     return Plates(*numbers, r, middle, nodes, start.ravel(), *of_blades)
 
 
-def as_wires(rotors: Rotors) -> Rotors:
-    """Return rotors with the edges of their blades alone. A stated level of a plate is that along
-    its normal, and none of its edges."""
-    if rotors.chord_m is None:
-        return rotors
-    return rotors.model_copy(update={"chord_m": None, "blade_dbsm": None})
-
-
 def points_of(rotors: Rotors, waveform: Waveform) -> int:
     """Return the number of points of a UAV's blades, of which a path has one copy in each slot."""
     return blades_of(rotors, waveform, 0, "").radius.size
@@ -255,14 +206,6 @@ def chord_nodes(rotors: Rotors, waveform: Waveform) -> np.ndarray:
     )
     beyond = k * r.chord_m * (turn + w.bandwidth / (2 * w.carrier_frequency))
     return np.asarray(np.polynomial.legendre.leggauss(degree(beyond, CHORD_LEFT_OUT))[0])
-
-
-def lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return Lagrange's polynomials of nodes (M,) at places (Q,): (M, Q)."""
-    out = np.ones((nodes.size, at.size))
-    for m, n in itertools.permutations(range(nodes.size), 2):
-        out[m] *= (at - nodes[n]) / (nodes[m] - nodes[n])
-    return out
 
 
 def blade_section(rotors: Rotors, wave_number: float = 0.0) -> float:

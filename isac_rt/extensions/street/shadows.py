@@ -1,19 +1,11 @@
-r"""Shadows of boxes that move, constant over pieces of a frame.
+r"""Shadows of boxes that move, constant over pieces of a frame (docs/moving.md: a screen's factor).
 
-The part of a box that lies between the ends of a straight part of a path is a screen across it, in
-the middle of that part: the smallest rectangle about its silhouette, along the path, whose one side
-is level. By Babinet's principle its factor is, with `knife_edge` F of the edges at the heights u
-and v in Fresnel units,
-
-.. math:: 1 - \big(F(u_1) - F(u_2)\big)\big(F(v_1) - F(v_2)\big)
-
-exact in the Fresnel approximation for a rectangle (M. Born and E. Wolf, *Principles of Optics*,
-section 8.7). A Fresnel unit is that of the distances along the path to the terminals or scatterers
-before and after the screen: waves go on over faces that reflect, and begin anew where a UAV or
-another scatterer sends them. Within a frame ends, UAVs and points of reflection move on straight
-lines. Since :math:`|F'| = 1/\sqrt2` and :math:`|F(v_1) - F(v_2)| \le 1.4`, an edge that moves by
-one Fresnel unit changes the factor by one at most. Pieces, all of one length, are as short as
-`STEP` asks.
+A Fresnel unit is that of the distances along the path to the terminals or scatterers before and
+after the screen: waves go on over faces that reflect, and begin anew where a UAV or another
+scatterer sends them. Within a frame ends, UAVs and points of reflection move on straight lines.
+Since the knife edge F has :math:`|F'| = 1/\sqrt2` and :math:`|F(v_1) - F(v_2)| \le 1.4`, an edge
+that moves by one Fresnel unit changes the factor by one at most. Pieces, all of one length, are as
+short as `STEP` asks.
 """
 
 from __future__ import annotations
@@ -24,8 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isac_rt.extensions.street.faces import FIRST_BOX, TINY, Box
+from isac_rt.extensions.street.faces import FIRST_BOX, Box
 from isac_rt.extensions.street.motion import pieces
+from isac_rt.extensions.street.solid import TINY
 from isac_rt.frame.waveform import Waveform
 from isac_rt.propagation.pathset import PathKind, PathSet, merge
 from isac_rt.propagation.scatter_paths import LinkState

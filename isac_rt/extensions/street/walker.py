@@ -2,23 +2,20 @@ r"""Scattering centres of a pedestrian: a trunk, and limbs that swing as pendulu
 
 A cycle of two steps lasts :math:`T = 1.346\sqrt{H/v}` at speed v with the hips at height H
 (R. Boulic, N. Magnenat-Thalmann, D. Thalmann, A global human walking model with real-time kinematic
-personification, 1990: relative length of a cycle 1.346 times the root of relative speed). Legs
-swing by :math:`\arcsin(vT/(4L))` about the hips, which spans a step; arms by as much about the
-shoulders in the opposite phase. Knees and elbows stay straight. All centres share the pedestrian's
-cross-section alike, with phases of their own, as the places of a body's surface within a wavelength
-are unknown: they are drawn once, so that the sum over centres has that cross-section in the mean
-and is coherent over frames.
+personification, 1990). Legs swing by :math:`\arcsin(vT/(4L))` about the hips, which spans a step;
+arms by as much about the shoulders in the opposite phase. All centres share the pedestrian's
+cross-section alike, with phases of their own that are drawn once: places of a body's surface within
+a wavelength are unknown.
 """
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from isac_rt.extensions.street.motion import Motion
+from isac_rt.extensions.street.motion import CentreModel, Motion
 from isac_rt.randomness import generator
 from isac_rt.world.settings import Extent
 from isac_rt.world.swarm import Swarm
@@ -37,7 +34,7 @@ LARGEST_SWING = np.radians(40.0)
 
 
 @dataclass(frozen=True)
-class Walker:
+class Walker(CentreModel):
     """Points on straight limbs.
 
     Attributes
@@ -57,36 +54,18 @@ class Walker:
     rate: float
     amplitude: np.ndarray
 
-    replaces_echo: ClassVar[bool] = True
-    fading: ClassVar[float] = 0.0
-
     @property
     def speed(self) -> float:
-        """Speed of the fastest point [m/s]."""
         return float((self.length * self.swing).max() * self.rate)
 
     @property
     def jerk(self) -> float:
-        """Bound of the jerk of a point [m/s^3]: swings below a radian keep within twice the first
-        term."""
-        return 2 * self.speed * self.rate**2
+        return 2 * self.speed * self.rate**2  # twice the first term, for swings below a radian
 
-    def described(self, *towards: np.ndarray) -> str:
-        """Return the limbs in words."""
+    def described(self) -> str:
         return f"trunk and four limbs as {self.length.size} points"
 
-    def amplitudes(
-        self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
-    ) -> np.ndarray:
-        """(K,) square root of each point's cross-section [m]."""
-        return self.amplitude
-
-    def square_metres(self, incident: np.ndarray, observed: np.ndarray) -> float:
-        """Return the cross-section of all centres, added by power [m^2]."""
-        return float((np.abs(self.amplitude) ** 2).sum())
-
     def motion(self, time: np.ndarray) -> Motion:
-        """Return the points' motion in the body's axes at times (T,) [s]."""
         turn = self.phase + self.rate * time[:, None]
         angle, rate = self.swing * np.sin(turn), self.swing * self.rate * np.cos(turn)
         accel = -(self.rate**2) * angle

@@ -1,21 +1,12 @@
 r"""Air and rain between the terminals: attenuation of every path, and the rain's own echoes.
 
-A path of length L loses gamma L decibels (`air`), L its delay times c. Rain echoes are paths of
-random scatterers, many drops each, in cells of path length s = r_1 + r_2 between the ends:
-
-.. math::
-
-    E|g|^2 = \frac{\lambda^2}{(4\pi)^3} \int \frac{G_{tx} G_{rx}\, \eta}{r_1^2 r_2^2}\, dV,
-    \qquad dV = \frac{r_1 r_2}{2 L_0}\, ds\, dd\, d\varphi
-
-on ellipsoids about ends L_0 apart, d = r_1 - r_2. With d = s tanh(w), dd/(r_1 r_2) is 4 dw/s, so
-that scatterers that are uniform in s, w and the angle phi have equal shares of the radar equation.
-
-Paths, and not noise of the same power, are the right form for an FMCW radar with several antennas:
-the drops' echoes have a place in range, in Doppler by fall, wind, turbulence and flight, and in the
-phases between antennas; a passive terminal's carry data. Amplitudes are circular Gaussian and hold
-within a frame while delays move. Each frame draws anew: drops whose speeds differ by 1 m/s
-decorrelate in half a wavelength over that speed, 2 ms at 77 GHz, less than a frame.
+Rain echoes are paths of random scatterers, many drops each, that share the radar equation over the
+volume (docs/weather.md) in cells of path length s = r_1 + r_2 between the ends. On ellipsoids about
+ends L_0 apart, d = r_1 - r_2, the volume is :math:`dV = r_1 r_2/(2 L_0)\, ds\, dd\, d\varphi`. With
+d = s tanh(w), dd/(r_1 r_2) is 4 dw/s, so that scatterers that are uniform in s, w and the angle phi
+have equal shares. Amplitudes are circular Gaussian and hold within a frame while delays move. Each
+frame draws anew: drops whose speeds differ by 1 m/s decorrelate in half a wavelength over that
+speed, 2 ms at 77 GHz, less than a frame.
 """
 
 from __future__ import annotations
@@ -195,11 +186,13 @@ def plan_rows(
     attenuation = f"gas {air.gas:.3g} dB/km, rain {float(air.rain(0.0)):.3g} dB/km"
     if rain:
         drops = Drops(rain, frequency, settings.temperature_c + ZERO_CELSIUS)
-        attenuation += f" and {10 * np.log10(drops.reflectivity):.1f} dB of echo per metre"
+        echo = 10 * np.log10(drops.density @ drops.backscatter)  # of a cubic metre
+        attenuation += f" and {echo:.1f} dB of echo per metre"
     rows = []
     for row in budgets:
         passes = 2 if len(set(row.link.split("->"))) == 1 else 1
         loss = (air.gas + float(air.rain(0.0))) * passes * row.distance_m / 1e3
         cost = f"{attenuation}: {loss:.3g} dB of the {row.reference}"
-        rows.append({"what": "weather", "modelled": cost, "link": row.link})
-    return [one | {"left_out": "in what receivers expect"} for one in rows]
+        said = {"what": "weather", "modelled": cost, "left_out": "in what receivers expect"}
+        rows.append({**said, "link": row.link})
+    return rows
