@@ -138,7 +138,7 @@ EXTENSIONS = {
     "equipment": "isac_rt.extensions.city_receivers.standard:equipment_of",
     "two_bounces": "isac_rt.extensions.two_bounces.two_bounces:TwoBounces",
     "walls": "isac_rt.extensions.city_receivers.walls:Walls",
-    "expected_clutter": "isac_rt.extensions.city_receivers.expectation:make_expectation",
+    "expected_clutter": "isac_rt.extensions.city_receivers.expectation:MeshExpectation",
     "cooperation": "isac_rt.extensions.cooperation.swarm:Cooperation",
     "access": "isac_rt.extensions.access.protocol:establish_links",
     "feedback": "isac_rt.extensions.access.feedback:exchange",

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isac_rt.extensions.city_receivers.expectation import make_expectation
+from isac_rt.extensions.city_receivers.expectation import MeshExpectation
 from isac_rt.frame.antennas import unit_vector
 from isac_rt.frame.cube import IFCube, ReceiveArray, Reference, Transmission
 from isac_rt.frame.level import thermal_noise_power, transmit_amplitude
@@ -147,7 +147,7 @@ class Scenes:
         if mesh_std not in self._expectations:
             city = s.city.displaced(mesh_std, generator(s.scenario.seed, "mesh error"))
             about = s.scenario.clutter, s.swarm, city, s.waveform, s.arrays, s.scenario.seed
-            self._expectations[mesh_std] = make_expectation(*about)
+            self._expectations[mesh_std] = MeshExpectation(*about)
         copy = self._expectations[mesh_std]
         return copy.clutter(place, pose, self.epoch, self.amplitude)
 

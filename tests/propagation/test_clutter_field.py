@@ -439,7 +439,7 @@ def expectation(
     level_db=0.0,
 ):
     """A terminal's own copy of the mesh and its pose."""
-    from isac_rt.extensions.city_receivers.expectation import make_expectation
+    from isac_rt.extensions.city_receivers.expectation import MeshExpectation
 
     tree = {
         "frames": 40,
@@ -460,7 +460,7 @@ def expectation(
     s = scenario.Scenario.model_validate(tree)
     w = waveform_of(s.radio, s.array)
     swarm, antennas = swarm_of(s), antennas_of(s.array, w)
-    copy = make_expectation(s.clutter, swarm, city, w, Arrays(antennas), s.seed, None, level_db)
+    copy = MeshExpectation(s.clutter, swarm, city, w, Arrays(antennas), s.seed, None, level_db)
     return copy, swarm.poses(0.0)["A"]
 
 

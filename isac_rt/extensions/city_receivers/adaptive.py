@@ -38,8 +38,9 @@ from isac_rt.receive.cfar import CfarRule, strong_lobes
 from isac_rt.receive.directions import (
     PRUNED,
     Search,
+    channel_search,
     inverses,
-    search_of,
+    receiver_search,
     search_plain,
     search_white,
 )
@@ -144,8 +145,9 @@ class DirectionTest:
         taper: Taper = TAPER,
     ) -> DirectionTest:
         """Return the test of a frame of such mean power (rows, P) of a channel."""
-        a, looks = known.antennas, 1 if known.passes == 2 else known.antennas.num_tx
-        search = search_of(a, known.wavenumber, known.passes, a.view_limit)
+        own, antennas = known.passes == 2, known.antennas
+        search = (channel_search if own else receiver_search)(antennas, known.wavenumber)
+        looks = 1 if own else antennas.num_tx
         usual, sure = (
             field_threshold(*scanned(search), looks, rate) for rate in settings.false_alarm_rates
         )

@@ -1,5 +1,4 @@
-"""The clutter that a terminal predicts from its own copy of the mesh. Import only after
-`isac_rt.runtime.activate()`.
+"""The clutter that a terminal predicts from its own copy of the mesh.
 
 Its surfaces are cut as finely as the scenario's field, its points are its own. What an active
 terminal expects of its own link is cut finer near by (`NEAR`) and merged where noise covers it.
@@ -9,9 +8,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import mitsuba as mi
 import numpy as np
 
+from isac_rt import runtime
 from isac_rt.extensions.two_bounces.two_bounces import TwoBounces
 from isac_rt.frame.antennas import Arrays
 from isac_rt.frame.link import Link
@@ -33,33 +32,44 @@ dB over the noise is whitened only where the draw is dense."""
 
 
 class MeshExpectation:
-    """Expected clutter along the flights of one run."""
+    """Expected clutter along the flights of one run, by the receivers' copy of the mesh; starts the
+    JIT back end.
+
+    Parameters
+    ----------
+    floor : of the active terminals' own links; None: nothing is merged
+    level_db : error of the expected level
+    """
 
     def __init__(
         self,
         clutter: Clutter,
         swarm: Swarm,
         city: CityMesh,
-        scene: mi.Scene,
+        waveform: Waveform,
         arrays: Arrays,
-        wavelength: float,
         seed: int,
         floor: NoiseFloor | None = None,
+        level_db: float = 0.0,
     ) -> None:
+        runtime.activate()
+        from isac_rt.world.city.scene import shared_scenes
+
+        scene = shared_scenes(city, waveform.carrier_frequency).faces
         own = int(seed_sequence(seed, "expected clutter").generate_state(1)[0])
-        about = city, scene, wavelength, own
+        about = city, scene, waveform.wavelength, own
         density = Density.of(clutter)
         self._field = ClutterField.plan(density, swarm, *about)
         senders = {name: swarm.uavs[name] for name in swarm.transmitters}
         alone = replace(swarm, uavs=senders)
         self._own = ClutterField.plan(replace(density, near=NEAR), alone, *about, floor)
         self._two_bounces = (
-            TwoBounces.plan(self._field, city, wavelength, own, clutter.mirrors)
+            TwoBounces.plan(self._field, city, waveform.wavelength, own, clutter.mirrors)
             if clutter.mirrors
             else None
         )
         self._city, self._arrays = city, arrays
-        self.level = 1.0  # factor of all amplitudes, of terminals that are wrong about it
+        self._level = 10 ** (level_db / 20)  # factor of all amplitudes
 
     def __len__(self) -> int:
         return len(self._field.cells)
@@ -74,7 +84,7 @@ class MeshExpectation:
         amplitude : sqrt(transmit power of one antenna) [sqrt(W)]
         """
         local = self._local(pose)
-        amplitude *= self.level
+        amplitude *= self._level
         state = LinkState(Link(name, name), time, local, local)
         mirrored = [] if self._two_bounces is None else self._two_bounces.seen(state)
         parts = [self._own.seen(state), *(part.seen for part in mirrored)]
@@ -112,7 +122,7 @@ class MeshExpectation:
         for seen in [self._field.from_places(state), *(part.seen for part in mirrored)]:
             tx, rx = (self._arrays.of(name) for name in link)
             received = rx.element_gain(end.to_body(seen.arrival))
-            gain = self.level * np.sqrt(tx.gain * received)
+            gain = self._level * np.sqrt(tx.gain * received)
             parts.append(_expected(seen, amplitude * gain, end))
         return ExpectedClutter.joined(parts)
 
@@ -129,26 +139,3 @@ def _expected(seen: Visible, amplitude: np.ndarray, axes: Pose) -> ExpectedClutt
         axes.to_body(seen.departure)[some],
         axes.to_body(seen.arrival)[some],
     )
-
-
-def make_expectation(
-    clutter: Clutter,
-    swarm: Swarm,
-    city: CityMesh,
-    waveform: Waveform,
-    arrays: Arrays,
-    seed: int,
-    floor: NoiseFloor | None = None,
-    level_db: float = 0.0,
-) -> MeshExpectation:
-    """The receivers' copy of the mesh; starts the JIT back end. `floor`: of the active terminals'
-    own links; None: nothing is merged. `level_db`: error of the expected level."""
-    from isac_rt import runtime
-
-    runtime.activate()
-    from isac_rt.world.city.scene import shared_scenes
-
-    scene = shared_scenes(city, waveform.carrier_frequency).faces
-    found = MeshExpectation(clutter, swarm, city, scene, arrays, waveform.wavelength, seed, floor)
-    found.level = 10 ** (level_db / 20)
-    return found

@@ -93,12 +93,6 @@ class Walls:
         feet = place - off[:, None] * normals[near]
         return bool(self.holds(near, feet, reach).any())
 
-    def bounded(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
-        """Return whether points (n, 3) lie in the box about a mirror's faces, or within `edge` of
-        it."""
-        low, high = self.boxes
-        return ((points >= low[mirrors] - edge) & (points <= high[mirrors] + edge)).all(axis=1)
-
     @property
     def boxes(self) -> np.ndarray:
         """(2, W, 3) lowest and highest corner of each mirror's faces, world coordinates."""
@@ -130,7 +124,8 @@ class Walls:
         tried, n, behind, before = tried[some], n[some], behind[some], before[some]
         places = mirror_image(target[:3], n, offsets[tried])
         met = end[:3] + (places - end[:3]) * (before / (before + behind))[:, None]
-        boxed = self.bounded(tried, met, edge)
+        low, high = self.boxes[:, tried]
+        boxed = ((met >= low - edge) & (met <= high + edge)).all(axis=1)
         shown = np.flatnonzero(boxed)[self.holds(tried[boxed], met[boxed], edge)]
         return tried[shown], np.hstack([places, mirror_image(target[3:6], n)])[shown]
 

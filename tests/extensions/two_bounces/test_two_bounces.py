@@ -27,7 +27,7 @@ from truths.clutter import STREETS, Flight, sionna_power
 from truths.truths import slab_reflection
 
 from isac_rt import scenario
-from isac_rt.extensions.city_receivers.expectation import make_expectation
+from isac_rt.extensions.city_receivers.expectation import MeshExpectation
 from isac_rt.frame.antennas import Arrays, antennas_of
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import waveform_of
@@ -473,7 +473,7 @@ def test_what_a_terminal_expects_of_mirrors():
     )
     model = propagation_in(city, s)
     swarm = swarm_of(s)
-    copy = make_expectation(s.clutter, swarm, city, w, Arrays(antennas), s.seed)
+    copy = MeshExpectation(s.clutter, swarm, city, w, Arrays(antennas), s.seed)
     pose = swarm.poses(0.0)["A"]
     parts = copy._two_bounces.seen(LinkState(Link("A", "A"), 0.0, pose, pose))
     once = len(copy._own.seen(LinkState(Link("A", "A"), 0.0, pose, pose)).index)
@@ -524,7 +524,7 @@ def test_what_a_passive_terminal_expects_of_mirrors():
     antennas = antennas_of(s.array, w)
     city = joined(rectangle(*WALL, METAL), rectangle(*GROUND, METAL))
     swarm, link = swarm_of(s), Link("A", "P")
-    copy = make_expectation(s.clutter, swarm, city, w, Arrays(antennas), s.seed)
+    copy = MeshExpectation(s.clutter, swarm, city, w, Arrays(antennas), s.seed)
     own = swarm.poses(0.0)["P"]
     sender = np.array([0.7, -1.3, 1.1, 3.1, -2.3, 0.7])
     start = replace(own, position=sender[:3], velocity=sender[3:])
