@@ -121,7 +121,6 @@ class ActiveTerminal(Stateful):
             )
         self._receiver = ActiveReceiver.of(antennas, receivers)
         self.tracker = Tracker(tracking, Ambiguity.of(waveform, 2))
-        self._hints = NO_HINTS
         self.state = OwnErrors()
 
     @property
@@ -156,7 +155,6 @@ class ActiveTerminal(Stateful):
             clutter = before.apply(clutter)
         self.tracker.predict(time)
         own = Ownship(own_pose, time, reported_poses, reports)
-        self._hints = Hints(clutter)
         reception = _reception(self.receive(cube, payload, clutter, maps))
         if reception.correction is not None:
             before = before or Correction(0.0, np.zeros(3))
@@ -174,7 +172,7 @@ class ActiveTerminal(Stateful):
         maps: bool,
     ) -> Reception:
         """Return what the terminal makes of one frame's samples; custom receivers replace it."""
-        return self._receiver.receive(cube, payload, self._hints, maps=maps)
+        return self._receiver.receive(cube, payload, Hints(clutter), maps=maps)
 
 
 class PassiveTerminal(Stateful):

@@ -146,11 +146,9 @@ def find_peaks(cube: IFCube, time: float, modulated: bool) -> Peaks:
     halves = [np.exp(-1j * np.pi * h * fast / size) for h in (0, 1)]
     factors = [np.broadcast_to(h.astype(np.complex64), (chirps, size)) for h in halves]
     spectra = new_memory((2, num_rx, size, chirps))
-    cells, half_cells = (
-        np.empty((groups, chirps, PEAKS)),
-        np.empty((groups, chirps, PEAKS), np.int64),
-    )
-    values = np.empty((groups, chirps, PEAKS, num_rx), np.complex64)
+    cells = np.empty((groups, chirps, PEAKS))
+    half_cells = np.empty(cells.shape, np.int64)
+    values = np.empty((*cells.shape, num_rx), np.complex64)
     noise = np.empty(groups)
     every = np.arange(chirps)
     for m in range(groups):
@@ -169,15 +167,9 @@ def find_peaks(cube: IFCube, time: float, modulated: bool) -> Peaks:
             half_cells[m, :, k] = at
             values[m, :, k] = spectra[at % 2, :, at // 2, every]
     phasor = np.exp(1j * np.pi * half_cells / 2 * ((size - 1) / size))
-    return Peaks(
-        time,
-        modulated,
-        w,
-        cube.schedule,
-        cells.astype(np.float32),
-        (values * phasor[..., None]).astype(np.complex64),
-        float(noise.mean()),
-    )
+    values = (values * phasor[..., None]).astype(np.complex64)
+    frame = time, modulated, w, cube.schedule
+    return Peaks(*frame, cells.astype(np.float32), values, float(noise.mean()))
 
 
 def acquire(batch: Sequence[Peaks], antennas: Antennas, order: int) -> DataPath | None:

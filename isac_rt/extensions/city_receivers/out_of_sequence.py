@@ -130,24 +130,14 @@ class OutOfSequence(OtherPaths):
         edge = WELL_INSIDE * self._receiver.antennas.view_limit
         return bool((np.abs(d.direction[d.is_reference]) < edge).all())
 
-    def read(
-        self,
-        cube: IFCube,
-        time: float,
-        hints: Hints,
-        *,
-        maps: bool,
-    ) -> Reception | None:
+    def read(self, cube: IFCube, time: float, hints: Hints, *, maps: bool) -> Reception | None:
         """A data frame that the line of sight does not read, over the path that is known or that it
         makes known; None where there is none yet."""
-        if self.state.path is not None:
+        out = self._over(cube, time, hints, maps=maps)
+        if out is None:
+            self.state.path = self._learn(cube, time, True)
             out = self._over(cube, time, hints, maps=maps)
-            if out is not None:
-                return out
-        self.state.path = self._learn(cube, time, True)
-        if self.state.path is None:
-            return None
-        return self._over(cube, time, hints, maps=maps)
+        return out
 
     def search(self, cube: IFCube, time: float) -> None:
         """A frame without data, which tells the whole cells of those that wait."""
@@ -200,16 +190,10 @@ class OutOfSequence(OtherPaths):
                     self.late += (Late(one.time, reception),)
         return path
 
-    def _over(
-        self,
-        cube: IFCube,
-        time: float,
-        hints: Hints,
-        *,
-        maps: bool,
-    ) -> Reception | None:
+    def _over(self, cube: IFCube, time: float, hints: Hints, *, maps: bool) -> Reception | None:
         """A frame read over the path, which it makes known better; None where it cannot be."""
-        assert self.state.path is not None
+        if self.state.path is None:
+            return None
         self.state.path = self.state.path.at(time)
         expected = self.state.path.prediction
         if expected.range_std[0] > COAST_CELLS * self._cells[0]:

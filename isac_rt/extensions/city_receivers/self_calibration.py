@@ -165,10 +165,7 @@ class SelfCalibration(HardwareModel):
             np.zeros(2),
             np.diag(np.square(CLOCK_STD[2 - passes])),
         )
-        self._corrected = (*self._known()[:-1], np.zeros(2))
-
-    def _known(self) -> tuple[np.ndarray, ...]:
-        return self.state.gains.value, self.state.slopes.value, self.state.common, self.state.clock
+        self._corrected = replace(self.state)  # by which the frame's samples were corrected
 
     @property
     def clock(self) -> np.ndarray:
@@ -187,7 +184,7 @@ class SelfCalibration(HardwareModel):
         walk = np.diag(np.square(CLOCK_DRIFT)) * (elapsed * (self.state.clock_covariance[1, 1] > 0))
         self.state.clock_covariance = F @ self.state.clock_covariance @ F.T + walk
         clock = self.state.clock if self._passes == 2 else np.zeros(2)
-        self._corrected = (*self._known()[:-1], clock)
+        self._corrected = replace(self.state, clock=clock)
         table = self._table(cube.waveform)
         out = np.empty_like(cube.samples)
         for m, senders in enumerate(cube.schedule):
@@ -204,7 +201,7 @@ class SelfCalibration(HardwareModel):
             v[0] + 1j * v[1]
             for v in (self.state.gains.value, self.state.slopes.value, self.state.common)
         )
-        tone = 2 * np.pi * w.slope * self._corrected[-1][0] * w.sample_interval * n
+        tone = 2 * np.pi * w.slope * self._corrected.clock[0] * w.sample_interval * n
         shared = common @ modes + 1j * tone
         own = self._elements if self._passes == 2 else self._elements[: self._antennas.num_rx]
         each = (own @ gain)[:, None] + np.multiply.outer(own @ slope, modes[1])
@@ -235,9 +232,10 @@ class SelfCalibration(HardwareModel):
     def learn(self, measured: PathChannels, known_direction: KnownDirection) -> None:
         """Take in a measured path at corrected samples."""
         towards, across = self._steering(known_direction)
-        gains, slopes, common, clock = (
-            now - then for now, then in zip(self._known(), self._corrected, strict=True)
-        )
+        known, corrected = self.state, self._corrected
+        gains = known.gains.value - corrected.gains.value
+        slopes = known.slopes.value - corrected.slopes.value
+        common, clock = known.common - corrected.common, known.clock - corrected.clock
         left_out = self._elements @ (gains[0] + 1j * gains[1])
         modes = measured.modes.reshape(MODES, -1) * np.exp(-left_out) * towards.conj()
         power = float(np.mean(np.abs(modes[0]) ** 2))
@@ -258,14 +256,10 @@ class SelfCalibration(HardwareModel):
     def _steering(self, known_direction: KnownDirection) -> tuple[np.ndarray, np.ndarray]:
         """Response (C,) of the channels to a wave, and its phase's derivative (C, 2) with respect
         to u_x and u_z."""
-        omega = 2 * np.pi * self.waveform.effective_carrier
-        a = self._antennas
-        rx, d_rx = element_delays(a.rx_positions, known_direction.direction, known_direction.radius)
-        tx, d_tx = np.zeros(a.num_tx), np.zeros((2, a.num_tx))
-        if self._passes == 2:
-            tx, d_tx = element_delays(
-                a.tx_positions, known_direction.direction, known_direction.radius
-            )
+        omega, a = 2 * np.pi * self.waveform.effective_carrier, self._antennas
+        towards = known_direction.direction, known_direction.radius
+        rx, d_rx = element_delays(a.rx_positions, *towards)
+        tx, d_tx = element_delays((self._passes - 1) * a.tx_positions, *towards)
         phase = omega * (tx[:, None] + rx).ravel()
         across = omega * (d_tx[:, :, None] + d_rx[:, None]).reshape(2, -1)
         return np.exp(1j * phase), across.T
@@ -323,9 +317,8 @@ class SelfCalibration(HardwareModel):
         self.state.slopes = Belief(self.state.slopes.value + np.stack(steps), np.stack(after))
         own = np.stack([left[0] - self._elements @ (steps[0] + 1j * steps[1]), *left[1:]])
         mean = own @ weight / weight.sum()
-        seen = np.array(
-            [[0, 1, 1, 1], [0, 0, 1, 1]]
-        )  # a common imaginary slope is the path's delay
+        # a common imaginary slope is the path's delay
+        seen = np.array([[0, 1, 1, 1], [0, 0, 1, 1]])
         new = np.stack([np.append(0, mean.real), np.append(0, mean.imag)]) * seen
         information = self.state.common_information + seen * weight.sum()
         self.state.common = self.state.common + new * (seen * weight.sum() / information)
@@ -334,7 +327,7 @@ class SelfCalibration(HardwareModel):
     def _learn_of_neighbours(self, seen: Neighbours) -> None:
         """Phases between channels, of which the frame's samples still hold what it has learnt."""
         X = self._elements[seen.second] - self._elements[seen.first]
-        left = seen.phase - X @ (self.state.gains.value[1] - self._corrected[0][1])
+        left = seen.phase - X @ (self.state.gains.value[1] - self._corrected.gains.value[1])
         left = np.angle(np.exp(1j * left))
         weight = 1 / (np.maximum(seen.std, LEAST_PHASE) ** 2 + MESH_PHASE**2)
         own = self.state.gains.information
@@ -380,10 +373,6 @@ def _padded(information: np.ndarray, size: int) -> np.ndarray:
 
 def _marginal(information: np.ndarray, size: int) -> np.ndarray:
     """Information of the first values, whatever the others are."""
-    own, mixed, other = (
-        information[:size, :size],
-        information[:size, size:],
-        information[size:, size:],
-    )
-    out = own - mixed @ np.linalg.solve(other, mixed.T)
+    mixed, other = information[:size, size:], information[size:, size:]
+    out = information[:size, :size] - mixed @ np.linalg.solve(other, mixed.T)
     return (out + out.T) / 2
