@@ -246,9 +246,12 @@ class Reference(Stateful):
         return passes_check(demodulate_bits(raw, reception.transitions[groups], w, order), w, order)
 
     def lengthen(self, cells: int, own: Pose) -> None:
-        """Add whole cells to the track's range; what is known of slips is over."""
+        """Push the track along the line of sight by whole cells; what is known of slips is over."""
         if self.track is not None:
-            self.track.state = _moved(self.track.state, own, cells * self.cells[0])
+            mean = self.track.state.mean.copy()
+            span = mean[:3] - own.position
+            mean[:3] += span / np.linalg.norm(span) * (cells * self.cells[0])
+            self.track.state = Gaussian(mean, self.track.state.covariance)
             self.state.ends = []
 
 
@@ -279,11 +282,3 @@ def slip_cells(ends: np.ndarray, num_symbols: int) -> int:
     if high >= 2 and not (ends < ends.max() - last).any():
         return int(ends.max()) - last
     return 0
-
-
-def _moved(state: Gaussian, own: Pose, distance: float) -> Gaussian:
-    """Return a state pushed along the line of sight."""
-    span = state.mean[:3] - own.position
-    mean = state.mean.copy()
-    mean[:3] += span / np.linalg.norm(span) * distance
-    return Gaussian(mean, state.covariance)

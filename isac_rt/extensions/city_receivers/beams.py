@@ -94,9 +94,7 @@ def demodulate_beams(
     raw = cells[best]
     peak = np.take_along_axis(metric, best[..., None], axis=-1)[..., 0]
     sure = peak / np.maximum((metric.sum(axis=-1) - peak) / (cells.size - 1), 1e-300)
-    picked = np.take_along_axis(spectra, best[None, ..., None], axis=-1)[..., 0].astype(
-        np.complex128
-    )
+    picked = np.take_along_axis(spectra, best[None, ..., None], axis=-1)[..., 0].astype(complex)
     for k in range(len(rows)):
         picked[k] *= np.exp(-2j * np.pi * known_cycles(w, delays[k], rates[k], raw))
     delay = np.clip(raw, 0, w.num_delay_symbols - 1)
@@ -141,11 +139,8 @@ def _beam_spectra(
         w.beat_cells(r / SPEED_OF_LIGHT, v / SPEED_OF_LIGHT)
         for r, v in zip(p.range, p.velocity, strict=True)
     ]
-    weights = (
-        beam_weights(p, np.array([b.mean() for b in beats]), antennas, w)
-        .conj()
-        .astype(np.complex64)
-    )
+    weights = beam_weights(p, np.array([b.mean() for b in beats]), antennas, w)
+    weights = weights.conj().astype(np.complex64)
     out = np.empty((len(beats), *shape, cells.size), np.complex64)
     made = np.empty((1, cells.size, shape[1]), np.complex64)
     for m in range(shape[0]):

@@ -58,12 +58,8 @@ class Bucketed:
         rows = w.num_range_cells + 2 * REACH
         row = np.round(beat).astype(np.int64) + REACH
         received = (row >= 0) & (row < rows) & (clutter.power * strongest > LEAST_WEIGHT * noise)
-        clutter, beat, doppler, row = (
-            clutter.select(received),
-            beat[received],
-            doppler[received],
-            row[received],
-        )
+        clutter = clutter.select(received)
+        beat, doppler, row = (of[received] for of in (beat, doppler, row))
         steer = turned(-known.wavenumber * (clutter.arrival @ search.channels.positions.T))
         power = (clutter.power / noise).astype(np.float32)
         if len(leaks) > 1:  # the same scatterers once more for each image

@@ -61,17 +61,16 @@ def echoes(
 ) -> list[tuple[PathChannels, KnownDirection]]:
     """Looks at an active terminal that show another terminal or a confirmed track, each once, the
     terminals first."""
+    ahead = [p for p in reported_poses if own.to_body(p.position - own.position)[1] > 0]
+    known = [_known(pose, own, 2) for pose in ahead]
+    seen = tracks.confirmed & (tracks.detection >= 0) & np.isfinite(tracks.direction).all(axis=1)
+    for k in np.flatnonzero(seen):
+        direction = KnownDirection(tracks.direction[k], float(tracks.range[k]), FREE)
+        known.append((np.array([tracks.range[k], tracks.velocity[k]]), direction))
     out, left = [], list(measured_paths)
-    for pose in reported_poses:
-        expected, known_direction = _known(pose, own, 2)
+    for expected, known_direction in known:
         nearest = _nearest(left, expected[:2], waveform)
-        if own.to_body(pose.position - own.position)[1] > 0 and nearest is not None:
-            out.append((left.pop(nearest), known_direction))
-    for k in np.flatnonzero(tracks.confirmed & (tracks.detection >= 0)):
-        expected = np.array([tracks.range[k], tracks.velocity[k]])
-        nearest = _nearest(left, expected, waveform)
-        if nearest is not None and np.isfinite(tracks.direction[k]).all():
-            known_direction = KnownDirection(tracks.direction[k], float(tracks.range[k]), FREE)
+        if nearest is not None:
             out.append((left.pop(nearest), known_direction))
     return out
 
@@ -95,9 +94,8 @@ def _known(pose: Pose, own: Pose, passes: int) -> tuple[np.ndarray, KnownDirecti
     back."""
     z = measure(np.concatenate([pose.position, pose.velocity]), own)
     of_path = np.array([z[0], z[1], POSITION_STD, VELOCITY_STD]) * passes / SPEED_OF_LIGHT
-    delay, rate, delay_std, rate_std = map(float, of_path)
-    path = delay, rate, delay_std, rate_std
-    return z, KnownDirection(z[2:], float(z[0]), POSITION_STD / float(z[0]), path)
+    delay, rate, *std = of_path.tolist()
+    return z, KnownDirection(z[2:], float(z[0]), POSITION_STD / float(z[0]), (delay, rate, *std))
 
 
 def _nearest(
