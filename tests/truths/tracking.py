@@ -6,6 +6,7 @@ import itertools
 from functools import lru_cache
 
 import numpy as np
+from one_detection import initiate
 from scipy import stats
 
 from isac_rt.results.metrics import binomial_interval, gospa
@@ -14,7 +15,6 @@ from isac_rt.track.filter import (
     MANOEUVRE_TIME,
     Gaussian,
     bistatic_distance,
-    initiate,
     jacobian,
     measure,
     predict,
