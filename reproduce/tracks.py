@@ -15,7 +15,8 @@ from isac_rt.frame.waveform import waveform_of
 from isac_rt.simulation.setup import swarm_of
 from isac_rt.track.filter import (
     Ambiguity,
-    initiate,
+    Gaussian,
+    initiate_all,
     measure,
     measurement_covariance,
     predict,
@@ -91,7 +92,9 @@ def on_grid(runs: Sequence[xr.Dataset], uavs: Sequence[str], every: int, observe
                 raw = np.round(found / step) * step
                 z = np.array([raw[0], raw[1], np.sin(raw[2]), 0.0])
                 if state is None:
-                    state = initiate(z, std, own, acceleration_std=acceleration_std)
+                    first = z[None], std[None], own
+                    states = initiate_all(*first, acceleration_std=acceleration_std)[1]
+                    state = next((Gaussian(*of) for of in zip(*states, strict=True)), None)
                 else:
                     state = predict(state, time - last, acceleration_std)
                     state = update(
