@@ -1,420 +1,342 @@
-"""One set of fused tracks from the tracks of several terminals: which of them are one UAV, what
-they say of it together, and its name in the whole swarm.
+"""One filter per UAV, fed by the detections of all terminals: which tracks are one UAV, where it
+is, and its name in the whole swarm.
 
-A terminal is wrong about its own pose and clock, and so about all its tracks alike. These errors
-are states beside the UAVs: what two terminals see, and what they say of themselves, tells them,
-and that helps all other UAVs. What else tracks have in common is not known: they follow the same
-manoeuvres, and may rest on one transmitter's pose. Covariance intersection is consistent whatever
-it is.
+A terminal is wrong about its own pose and clock, and so about all its detections alike. These
+errors are states of each UAV's filter: what two terminals see of the UAV tells them apart from its
+motion, and what no terminal sees stays in its covariance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
-from itertools import product
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import gammaincinv
 
 from isac_rt.plain import Stateful
-from isac_rt.track.filter import Gaussian, mahalanobis, singer
+from isac_rt.track.filter import (
+    INITIAL_POSITION_STD_LIMIT,
+    INITIAL_SPEED_STD,
+    Gaussian,
+    conditioned,
+    curvature,
+    jacobian,
+    mahalanobis,
+    measure,
+    measurement_covariance,
+    narrowed,
+    resting,
+    singer,
+    transmitter_jacobian,
+)
 from isac_rt.track.fused import Fused, Key, Name
 from isac_rt.track.parts import POSE_STD
-from isac_rt.track.tracker import TrackSet, assign
+from isac_rt.track.tracker import assign
 from isac_rt.world.swarm import Pose
 
-MIN_SEPARATION_M = 0.5
-"""UAVs keep farther from each other than this [m]: tracks part beyond twice this."""
 SIZE = 6
-"""Position and velocity in world axes [m, m/s]: what terminals tell each other of a UAV."""
+"""Position and velocity in world axes [m, m/s]: what is told of a UAV."""
+STATES = 9
+"""And its acceleration [m/s^2]."""
+POSE_ERRORS = 9
+"""Errors of a terminal's position, velocity and attitude."""
 DATUM_STD = (0.05, 0.05)
-"""And of what all terminals are wrong alike, for they receive the same satellites [m, m/s]: nothing
-that they tell each other shows it, and all UAVs of a set of fused tracks have it."""
+"""Errors that all terminals have alike, for they receive the same satellites [m, m/s]: nothing that
+they tell each other shows them, and all fused tracks have them."""
 _DATUM = np.diag(np.repeat(np.square(DATUM_STD), 3))
 ATTITUDE_STD = np.radians(0.3)
-"""Deviation of a terminal's attitude about each axis [rad]: across the line of sight, times the
-range, it adds to what it says of others. Small inertial sensors with two antennas hold it."""
-ERRORS = 10
-"""Errors of a terminal: of its position, velocity and attitude, and of its ranges by its clock."""
-OWN_NOISE = 1e-3
-"""What is left of a terminal's word of itself without the errors of its pose: rounding [m, m/s]."""
+"""Deviation of a terminal's attitude about each axis [rad]. Small inertial sensors with two
+antennas hold it."""
+HOLD_S = 0.5
+"""How long a detection can be taken up in its order, and what was said counts without being said
+again [s]."""
 JOIN_PROBABILITY = 0.99
 SPLIT_PROBABILITY = 1 - 1e-6
 """Two tracks are joined within the first gate and parted beyond the second, so that noise does not
 join and part them in turns."""
 
-MASKED_CELLS = 3.0
-"""An echo that comes no more range cells than this behind a passive terminal's line of sight is
-pushed away from it: by the line's sidelobes, and by what is left where these were taken out."""
-PULL = 0.5
-"""Range cells of that push. It is alike from frame to frame, so that a track's own deviation knows
-nothing of it. Near the line of sight a metre of path length moves a UAV by thirty and more."""
-MOST_PULLED = 1e6
-"""On the line of sight a metre moves it by infinitely many. So many say as much as that nothing is
-known of it along its direction, and leave the digits of its covariance across it."""
-SAME_M = 1e-9
-"""Lengths that differ by less are the same [m]."""
 
-
-class Reported(NamedTuple):
-    """Reported target in world axes: its position and velocity (6,), covariance (6, 6) without the
-    reporter's errors, and (6, `ERRORS`) the effect of these errors, one deviation each."""
-
-    state: Gaussian
-    lever: np.ndarray
-
-    @property
-    def whole(self) -> Gaussian:
-        """The state with the errors of who tells."""
-        return Gaussian(self.state.mean, self.state.covariance + self.lever @ self.lever.T)
-
-    def after(self, interval: float, acceleration_std: float) -> Reported:
-        """The same an interval [s] later."""
-        lever = self.lever.copy()
-        lever[:3] += interval * lever[3:]
-        return Reported(advance(self.state, interval, acceleration_std), lever)
-
-
-@dataclass(frozen=True)
-class Report:
-    """Report of a terminal about one of its tracks.
+class Detection(NamedTuple):
+    """Detection that a track took.
 
     Attributes
     ----------
     key : the track
     since : when it was confirmed [s]
-    name : by which it knows the UAV
-    time : that the state is of [s]
-    state, lever : as in `Reported`; by default the errors of who tells do nothing
+    name : by which the sender knows the UAV
+    time : of the middle of the frame [s]
+    own : pose of its terminal, as that believes it
+    transmitter : (6,) state of the transmitter of a passive terminal, as that reports it; (0,) at
+        an active one
+    bias_std : deviation of the error that all ranges of the track share [m]
+    measured, std : (4,) as in `isac_rt.track.filter.measure`, in the track's reading of an ambiguous
+        velocity, and their deviations
     """
 
     key: Key
     since: float
     name: Name
     time: float
-    state: Gaussian
-    lever: np.ndarray = field(default_factory=lambda: np.zeros((SIZE, ERRORS)))
+    own: Pose
+    transmitter: np.ndarray
+    bias_std: float
+    measured: np.ndarray
+    std: np.ndarray
 
     @property
     def own_name(self) -> Name:
         """The name that the track alone would give."""
         return Name(self.since, *self.key)
 
-    @cached_property
-    def whole(self) -> Gaussian:
-        """The state with the errors of who tells."""
-        return Reported(self.state, self.lever).whole
+    @property
+    def sender(self) -> np.ndarray | None:
+        """State of a passive terminal's transmitter."""
+        return self.transmitter if self.transmitter.size else None
 
 
-def at_once(reports: Iterable[Report], time: float, acceleration_std: float) -> list[Report]:
-    """Reports at one time [s]: `Reported.after` of each."""
-    some = list(reports)
-    if not some:
-        return []
-    intervals = [time - report.time for report in some]
-    still = np.eye(SIZE), np.zeros((SIZE, SIZE))
-    moved = [_coasting(t, acceleration_std) if t else still for t in intervals]
-    each = [(*r.state, r.lever, *of) for r, of in zip(some, moved, strict=True)]
-    means, covariances, levers, *model = (np.array(of) for of in zip(*each, strict=True))
-    F, Q = model
-    levers[:, :3] += np.array(intervals)[:, None, None] * levers[:, 3:]
-    means = (F @ means[..., None])[..., 0]
-    covariances = F @ covariances @ np.swapaxes(F, 1, 2) + Q
-    return [
-        Report(r.key, r.since, r.name, time, Gaussian(*state), lever)
-        for r, *state, lever in zip(some, means, covariances, levers, strict=True)
-    ]
+@dataclass
+class FusedUav:
+    """Filter of one UAV.
 
-
-def advance(state: Gaussian, interval: float, acceleration_std: float) -> Gaussian:
-    """Position and velocity (6,) after an interval [s] of Singer's model. The acceleration is not
-    told: it is zero with `acceleration_std` [m/s^2] per axis."""
-    if interval == 0:
-        return state
-    F, Q = _coasting(interval, acceleration_std)
-    return Gaussian(F @ state.mean, F @ state.covariance @ F.T + Q)
-
-
-@lru_cache(maxsize=64)
-def _coasting(interval: float, acceleration_std: float) -> tuple[np.ndarray, np.ndarray]:
-    """Transition (6, 6) of `advance`, and what it adds to the covariance."""
-    F, Q = singer(interval, acceleration_std)
-    unknown = acceleration_std * F[:SIZE, SIZE:]
-    return F[:SIZE, :SIZE].copy(), Q[:SIZE, :SIZE] + unknown @ unknown.T
-
-
-def in_world(
-    tracks: TrackSet, row: int, own: Pose, clock_std: float = 0.0, cell: float = 0.0
-) -> Reported:
-    """A track as it is told to others: its own covariance, and apart from it what the errors of the
-    terminal do to it: of its position and velocity (`POSE_STD`), of its attitude (`ATTITUDE_STD`),
-    which turns place and motion about the terminal, and of its clock (`clock_std`, the speed of
-    light times the deviation of what is left of its offset [m]). Its own covariance has what the
-    line of sight pulls, by the `cell` of ranges [m]."""
-    baseline = np.zeros(0)
-    if not tracks.is_reference[row] and tracks.is_reference.any():
-        baseline = tracks.mean[tracks.is_reference.argmax(), :3]
-    pulled, lever = _levers(tracks.mean[row], baseline, clock_std, cell)
-    mean = tracks.mean[row] + np.concatenate([own.position, own.velocity])
-    return Reported(Gaussian(mean, tracks.covariance[row] + np.outer(pulled, pulled)), lever)
-
-
-def _levers(
-    mean: np.ndarray, baseline: np.ndarray, clock_std: float, cell: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the effect of the line of sight on a track (6,) and of its terminal's errors, (6,
-    `ERRORS`); `baseline` (3,) is to a passive terminal's transmitter, (0,) where the track does not
-    depend on it."""
-    lever, pulled = np.zeros((SIZE, ERRORS)), np.zeros(SIZE)
-    lever[:3, :3], lever[3:, 3:6] = POSE_STD[0] * np.eye(3), POSE_STD[1] * np.eye(3)
-    lever[:3, 6:9], lever[3:, 6:9] = (
-        -ATTITUDE_STD * cross(mean[:3]),
-        -ATTITUDE_STD * cross(mean[3:]),
-    )
-    lever[:3, 9] = clock_std * _by_clock(mean[:3], baseline)
-    pulled[:3] = PULL * cell * _by_length(mean[:3], baseline, MASKED_CELLS * cell)
-    return pulled, lever
-
-
-def _norm(x: np.ndarray) -> float:
-    return float(np.linalg.norm(x))
-
-
-def _by_length(offset: np.ndarray, baseline: np.ndarray, masked: float) -> np.ndarray:
-    """Return the shift of a passive terminal's target (3,) per metre of path length.
-
-    It moves along its direction. Zero if the way is more than `masked` [m] longer than the line of
-    sight, and at an active terminal.
-    """
-    if not baseline.size:
-        return np.zeros(3)
-    rho = _norm(offset)
-    length = rho + _norm(offset - baseline)
-    if length - _norm(baseline) > masked:
-        return np.zeros(3)
-    u = offset / rho
-    # of rho = (L^2 - d^2) / (2 (L - d.u)) by L; on the line of sight L = d.u
-    apart_m = max(length - float(baseline @ u), (length - rho) / MOST_PULLED, SAME_M)
-    return u * (length - rho) / apart_m
-
-
-def _by_clock(offset: np.ndarray, baseline: np.ndarray) -> np.ndarray:
-    """Return the shift of a target (3,) for each metre that a terminal's clock adds to its ranges:
-    along its direction, by its path length and its reference's, which are both too long."""
-    rho = _norm(offset)
-    u = offset / rho
-    if not baseline.size:
-        return u
-    d = _norm(baseline)
-    length, ahead = rho + _norm(offset - baseline), baseline @ u
-    if length - ahead < SAME_M:  # on the line of sight
-        return u * (rho / d) ** 2
-    # of rho = (L^2 - d^2) / (2 (L - d.u)), L and d both by one metre
-    return u * (length - d - rho * (1 - ahead / d)) / (length - ahead)
-
-
-def report_of(itself: Gaussian) -> Reported:
-    """The same (`of_itself`) with the errors of its pose apart."""
-    lever = np.zeros((SIZE, ERRORS))
-    lever[range(SIZE), range(SIZE)] = np.repeat(POSE_STD, 3)
-    return Reported(Gaussian(itself.mean, OWN_NOISE**2 * np.eye(SIZE)), lever)
-
-
-def in_datum(state: Gaussian) -> Gaussian:
-    """A UAV (6,) with what all terminals are wrong alike."""
-    return Gaussian(state.mean, state.covariance + _DATUM)
-
-
-def intersection(a: Gaussian, b: Gaussian) -> Gaussian:
-    r"""Covariance intersection of two estimates whose correlation is not known.
-
-    .. math::
-
-        P^{-1} = w A^{-1} + (1-w) B^{-1},\quad x = P\,(w A^{-1} a + (1-w) B^{-1} b)
-
-    with the w in [0, 1] that makes the trace of P least, metres and metres a second alike. With
-    :math:`V^T B^{-1} V = I,\ V^T A^{-1} V = \Lambda` it is the one root of the trace's derivative,
-    :math:`\sum_i |v_i|^2 (\lambda_i - 1) / (w\lambda_i + 1 - w)^2 = 0`, or an end.
-
-    References
+    Attributes
     ----------
-    .. [1] S. J. Julier and J. K. Uhlmann, "A non-divergent estimation algorithm in the presence of
-       unknown correlations", Proc. American Control Conference, 1997,
-       doi:10.1109/ACC.1997.609105
-
-    Examples
-    --------
-    >>> a = Gaussian(np.array([1.0, 0.0]), np.diag([1.0, 9.0]))
-    >>> b = Gaussian(np.array([0.0, 2.0]), np.diag([9.0, 1.0]))
-    >>> fused = intersection(a, b)
-    >>> fused.mean.round(6).tolist(), fused.covariance.round(6).tolist()
-    ([0.9, 1.8], [[1.8, 0.0], [0.0, 1.8]])
+    name : in the swarm
+    members : tracks that are taken for it, with the name that each alone would give
+    found : their detections of the last `HOLD_S`, in order of time
+    states : after each of them: the UAV's 9 states, the errors of the terminals and of the ranges
+        of each link
+    tests : squared Mahalanobis distance of each of them from what was expected
+    base : time [s] and state before the first of them; None: it starts the filter
     """
-    mean, P, _ = _intersection(*a, *b)
-    return Gaussian(mean, P)
+
+    name: Name
+    members: dict[Key, Name]
+    found: list[Detection] = field(default_factory=list)
+    states: list[Gaussian] = field(default_factory=list)
+    tests: list[float] = field(default_factory=list)
+    base: tuple[float, Gaussian] | None = None
+
+    def change(self, found: Iterable[Detection]) -> None:
+        """Exchange the detections; those from the first that differs on are filtered again."""
+        new = sorted(found, key=lambda d: (d.time, d.key))
+        if self.base is not None:
+            new = [d for d in new if d.time >= self.base[0]]
+        same = 0
+        while same < min(len(new), len(self.states)) and new[same][:4:3] == self.found[same][:4:3]:
+            same += 1
+        self.found = new
+        del self.states[same:], self.tests[same:]
+
+    def worst(self) -> Key | None:
+        """Return the track whose detections lie farthest beyond the gate of what is expected of
+        this UAV; None: none does."""
+        beyond = {}
+        for key in self.members:
+            mine = [k for k, d in enumerate(self.found) if d.key == key]
+            size = sum(int(np.isfinite(self.found[k].measured).sum()) for k in mine)
+            if mine:
+                beyond[key] = sum(self.tests[k] for k in mine) / gate(SPLIT_PROBABILITY, size)
+        key = max(beyond, key=lambda k: beyond[k], default=None)
+        return key if key is not None and beyond[key] > 1 else None
 
 
-def _intersection(
-    a: np.ndarray, of_a: np.ndarray, b: np.ndarray, of_b: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Mean and covariance, of two, and the weight w of the first."""
-    A, B = np.linalg.inv(of_a), np.linalg.inv(of_b)
-    root = np.linalg.inv(np.linalg.cholesky((B + B.T) / 2))
-    values, U = np.linalg.eigh(root @ ((A + A.T) / 2) @ root.T)
-    V = root.T @ U
-    lengths = np.sum(V**2, axis=0)
+@dataclass
+class Followed:
+    """UAVs that a listener follows."""
 
-    def slope(w: float) -> float:
-        return float(np.sum(lengths * (values - 1) / (w * values + 1 - w) ** 2))
-
-    if slope(0.0) <= 0:
-        w = 0.0
-    elif slope(1.0) >= 0:
-        w = 1.0
-    else:
-        w = brentq(slope, 0.0, 1.0, xtol=1e-15)
-    P = (V / (w * values + 1 - w)) @ V.T
-    return P @ (w * (A @ a) + (1 - w) * (B @ b)), P, w
+    uavs: list[FusedUav] = field(default_factory=list)
 
 
-def intersection_of(states: Sequence[Gaussian]) -> Gaussian:
-    """Covariance intersection of one or more, one after the other, the surest first."""
-    return states[0] if len(states) == 1 else _intersected(states)[0]
-
-
-def _intersected(states: Sequence[Gaussian]) -> tuple[Gaussian, np.ndarray]:
-    """And the weight of each in it."""
-    if len(states) == 1:
-        return states[0], np.ones(1)
-    order = sorted(range(len(states)), key=lambda k: float(states[k].covariance.trace()))
-    fused, weights = states[order[0]], np.ones(len(states))
-    for at, k in enumerate(order[1:], 1):
-        mean, P, w = _intersection(*fused, *states[k])
-        fused = Gaussian(mean, P)
-        weights[order[:at]] *= w
-        weights[k] = 1 - w
-    return fused, weights
-
-
-def joint_states(
-    uavs: Sequence[Sequence[Report]], itself: Mapping[int, tuple[str, Reported]]
-) -> list[Gaussian]:
-    r"""UAVs from their tracks, jointly with the errors of the terminals that tell of them.
-
-    A track says :math:`y = b + L_y e + n` with the errors e of its terminal, one deviation each and
-    independent of all else, and with its own error n. Of the n of one UAV the correlation is not
-    known: each has the weight w of covariance intersection, which is consistent whatever it is. The
-    information of all, of the errors' own and of what terminals say of themselves is added up:
-
-    .. math:: \sum_y w_y A_y^T P_y^{-1} A_y + E + \sum_t B_t^T Q_t^{-1} B_t,\quad A_y = [I, L_y]
+class FusedTracks(Stateful):
+    """Fused tracks of a listener: an extended Kalman filter for each UAV with the errors of
+    terminals and links, and memory of which tracks are one UAV, and of its name.
 
     Parameters
     ----------
-    uavs : by body the reports of its tracks, all of one instant
-    itself : by number of a UAV the terminal that it is, and what that one says of itself
+    terminals, links : of the swarm, by name
+    acceleration_std : of UAVs, per axis [m/s^2]
     """
-    if not uavs:
-        return []
-    owners = {name for name, _ in itself.values()}
-    owners |= {_teller(report.key) for reports in uavs for report in reports}
-    links = dict.fromkeys(report.key.origin for reports in uavs for report in reports)
-    count = ERRORS - 1
-    of_pose = {name: range(count * k, count * (k + 1)) for k, name in enumerate(sorted(owners))}
-    size = count * len(of_pose)
-    clock = {origin: size + k for k, origin in enumerate(links)}
-    size += len(clock)
-    words: list[tuple[int, list[int], Reported, float]] = []
-    for k, reports in enumerate(uavs):
-        _, weights = _intersected([report.whole for report in reports])
-        for report, w in zip(reports, weights, strict=True):
-            errors = [*of_pose[_teller(report.key)], clock[report.key.origin]]
-            words.append((k, errors, Reported(report.state, report.lever), w))
-    # no clock is in a terminal's word of itself
-    words += [(k, [*of_pose[name], size], word, 1.0) for k, (name, word) in itself.items()]
-    return _solved(len(uavs), size, words)
 
+    def __init__(
+        self, terminals: Sequence[str], links: Sequence[str], acceleration_std: float
+    ) -> None:
+        self.state = Followed()
+        self._acceleration_std = acceleration_std
+        first = STATES + POSE_ERRORS * len(terminals)
+        self._pose = {name: STATES + POSE_ERRORS * k for k, name in enumerate(terminals)}
+        self._bias = {link: first + k for k, link in enumerate(links)}
+        of_uav = [INITIAL_POSITION_STD_LIMIT, INITIAL_SPEED_STD, acceleration_std]
+        of_pose = np.tile(np.repeat([*POSE_STD, ATTITUDE_STD], 3), len(terminals))
+        self._prior = np.diag(np.square([*np.repeat(of_uav, 3), *of_pose, *np.zeros(len(links))]))
 
-def _solved(
-    num_uavs: int, num_errors: int, words: Sequence[tuple[int, list[int], Reported, float]]
-) -> list[Gaussian]:
-    """The UAVs of `joint_states`, whose information of each other is by way of the errors alone:
-    the errors first, then each UAV.
+    def update(
+        self,
+        time: float,
+        detections: Iterable[Detection],
+        kept: Collection[Key],
+        known: Mapping[str, Gaussian],
+    ) -> list[Fused]:
+        """Return the UAVs at a time [s].
 
-    Parameters
-    ----------
-    words : a UAV's number, the numbers of the errors in what is told of it (`num_errors`: one that
-        is in none), what is told, and its weight
-    """
-    numbers, errors, reports, weights = zip(*words, strict=True)
-    given = [np.array(numbers), np.array(errors), np.array(weights, float)]
-    states = [[t.state.mean for t in reports], [t.state.covariance for t in reports]]
-    arrays = [np.array(of) for of in (*states, [t.lever for t in reports])]
-    every = _solution(num_uavs, num_errors + 1, *given, *arrays)
-    return [Gaussian(m, p) for m, p in zip(*every, strict=True)]
+        Parameters
+        ----------
+        detections : all that are known of the last `HOLD_S`
+        kept : tracks that still exist
+        known : what terminals say of themselves (6,)
+        """
+        by_key: dict[Key, list[Detection]] = {}
+        for d in sorted(detections, key=lambda d: d.time):
+            if d.key in kept and (d.key in by_key or _starts(d)):
+                by_key.setdefault(d.key, []).append(d)
+        self._take(by_key, kept)
+        states = [self._at(uav, time) for uav in self.state.uavs]
+        states = self._part(states, time)
+        states = self._join(states, time)
+        self._call(by_key)
+        whose = recognise(states, known)
+        return [
+            Fused(uav.name, Gaussian(g.mean, g.covariance + _DATUM), tuple(uav.members), terminal)
+            for uav, g, terminal in zip(self.state.uavs, states, whose, strict=True)
+        ]
 
+    def _take(self, by_key: Mapping[Key, list[Detection]], kept: Collection[Key]) -> None:
+        """Take up detections; tracks that have ended leave, and new ones are UAVs of their own."""
+        for uav in self.state.uavs:
+            uav.members = {key: name for key, name in uav.members.items() if key in kept}
+            own = [d for key in uav.members for d in by_key.get(key, ())]
+            uav.change([*own, *(d for d in uav.found if d.key not in uav.members)])
+        self.state.uavs = [uav for uav in self.state.uavs if uav.members]
+        known = {key for uav in self.state.uavs for key in uav.members}
+        for key, found in by_key.items():
+            if key not in known:
+                self.state.uavs.append(FusedUav(found[-1].name, {key: found[-1].own_name}, found))
 
-def _solution(
-    num_uavs: int,
-    num_errors: int,
-    numbers: np.ndarray,
-    errors: np.ndarray,
-    weights: np.ndarray,
-    means: np.ndarray,
-    covariances: np.ndarray,
-    levers: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Means and covariances of the UAVs from W words, of which the last error is in none."""
-    B, b = np.zeros((num_uavs, SIZE, SIZE)), np.zeros((num_uavs, SIZE))
-    C = np.zeros((num_uavs, num_errors, SIZE))
-    E, e = np.eye(num_errors), np.zeros(num_errors)
-    A = np.concatenate([np.broadcast_to(np.eye(SIZE), (len(levers), SIZE, SIZE)), levers], axis=2)
-    gain = weights[:, None, None] * np.swapaxes(np.linalg.solve(covariances, A), 1, 2)
-    each, more = gain @ A, (gain @ means[..., None])[..., 0]
-    np.add.at(B, numbers, each[:, :SIZE, :SIZE])
-    np.add.at(b, numbers, more[:, :SIZE])
-    np.add.at(e, errors, more[:, SIZE:])
-    np.add.at(C, (numbers[:, None], errors), each[:, SIZE:, :SIZE])
-    np.add.at(E, (errors[:, :, None], errors[:, None, :]), each[:, SIZE:, SIZE:])
-    D, d = np.linalg.solve(B, np.swapaxes(C, 1, 2)), np.linalg.solve(B, b[..., None])[..., 0]
-    E -= (C @ D).sum(axis=0)
-    e -= (C @ d[..., None])[..., 0].sum(axis=0)
-    rest = np.linalg.inv(E)
-    P = np.linalg.inv(B) + D @ rest @ np.swapaxes(D, 1, 2)
-    return d - D @ (rest @ e), (P + np.swapaxes(P, 1, 2)) / 2
+    def _part(self, states: list[Gaussian], time: float) -> list[Gaussian]:
+        """Make tracks whose detections are not those of their UAV UAVs of their own."""
+        uavs, out = self.state.uavs, list(states)
+        for k in range(len(uavs)):
+            key = uavs[k].worst()
+            if key is None:
+                continue
+            mine = [d for d in uavs[k].found if d.key == key]
+            if len(uavs[k].members) > 1:
+                own_name = uavs[k].members.pop(key)
+                uavs[k].change([d for d in uavs[k].found if d.key != key])
+                out[k] = self._at(uavs[k], time)
+                alone = FusedUav(own_name, {key: own_name}, mine)
+                uavs.append(alone)
+                out.append(self._at(alone, time))
+        return out
 
+    def _join(self, states: list[Gaussian], time: float) -> list[Gaussian]:
+        """Join UAVs that no terminal tells apart: as many as the gate allows, of the greatest
+        likelihood."""
+        uavs = self.state.uavs
+        cost = distances(states, states)
+        origins = [{key.origin for key in uav.members} for uav in uavs]
+        for i, j in np.ndindex(cost.shape):
+            if i >= j or origins[i] & origins[j]:
+                cost[i, j] = np.inf
+        gone: set[int] = set()
+        for i, j in assign(cost):
+            if not {i, j} & gone:
+                gone.add(j)
+                uavs[i].members |= uavs[j].members
+                uavs[i].name = min(uavs[i].name, uavs[j].name)
+                uavs[i].change([*uavs[i].found, *uavs[j].found])
+                states[i] = self._at(uavs[i], time)
+        self.state.uavs = [uav for k, uav in enumerate(uavs) if k not in gone]
+        return [g for k, g in enumerate(states) if k not in gone]
 
-def _teller(key: Key) -> str:
-    """The terminal that tells of a track."""
-    return key.origin.rpartition("->")[2]
+    def _call(self, by_key: Mapping[Key, list[Detection]]) -> None:
+        """Give names: the earliest that any member is known by; two UAVs never have the same. The
+        one with the track that the name is of keeps it, else the one that had it before."""
+        known = {key: found[-1] for key, found in by_key.items()}
+        for uav in self.state.uavs:
+            uav.name = min([uav.name, *(known[key].name for key in uav.members if key in known)])
+        holder: dict[Name, FusedUav] = {}
+        waiting = sorted(self.state.uavs, key=lambda b: Key(*b.name[1:]) not in b.members)
+        for uav in waiting:
+            if uav.name in holder:
+                uav.name = min(uav.members.values())
+            if uav.name in holder:  # by a UAV that lacks the track; it takes its own in its turn
+                waiting.append(holder[uav.name])
+            holder[uav.name] = uav
 
+    def _at(self, uav: FusedUav, time: float) -> Gaussian:
+        """Return a UAV's position and velocity at a time [s], after filtering what is new among its
+        detections; those that are older than `HOLD_S` are let go."""
+        for k in range(len(uav.states), len(uav.found)):
+            d = uav.found[k]
+            before = (uav.found[k - 1].time, uav.states[k - 1]) if k else uav.base
+            if before is None:
+                mean = np.zeros(len(self._prior))
+                mean[:STATES] = resting(d.measured[None], d.own, d.sender)[0]
+                before = d.time, Gaussian(mean, self._prior)
+            g, test = self._updated(self._predicted(before[1], d.time - before[0]), d)
+            uav.states.append(g)
+            uav.tests.append(test)
+        while len(uav.found) and uav.found[0].time < time - HOLD_S:
+            uav.base = uav.found.pop(0).time, uav.states.pop(0)
+            del uav.tests[0]
+        last, g = (uav.found[-1].time, uav.states[-1]) if uav.found else uav.base
+        g = self._predicted(g, time - last)
+        return Gaussian(g.mean[:SIZE], g.covariance[:SIZE, :SIZE])
 
-def distances(
-    a: Sequence[Gaussian], b: Sequence[Gaussian], probability: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """(len(a), len(b)) squared Mahalanobis distances and ln det S, S = A + B; infinite both where
-    the distance is outside the `gate`.
+    def _predicted(self, g: Gaussian, interval: float) -> Gaussian:
+        """Return a state after an interval [s]; errors stay as they are."""
+        if interval == 0:
+            return g
+        F, Q = singer(interval, self._acceleration_std)
+        mean, P = g.mean.copy(), g.covariance.copy()
+        mean[:STATES] = F @ mean[:STATES]
+        P[:STATES] = F @ P[:STATES]
+        P[:, :STATES] = P[:, :STATES] @ F.T
+        P[:STATES, :STATES] += Q
+        return Gaussian(mean, P)
 
-    What the errors have in common makes the true S smaller, so that this gate lets in more than
-    its share.
-    """
-    if not len(a) or not len(b):
-        return np.zeros((len(a), len(b))), np.zeros((len(a), len(b)))
-    means = [np.array([g.mean for g in of]) for of in (a, b)]
-    covariances = [np.array([g.covariance for g in of]) for of in (a, b)]
-    y = means[0][:, None] - means[1][None]
-    trace = covariances[0].trace(axis1=1, axis2=2)[:, None] + covariances[1].trace(axis1=1, axis2=2)
-    most = gate(probability)
-    i, j = np.nonzero((y**2).sum(axis=-1) <= most * trace)  # no variance is larger
-    d2, log_det = np.full((2, *y.shape[:2]), np.inf)
-    near, of_near = mahalanobis(y[i, j], covariances[0][i] + covariances[1][j])
-    inside = near <= most
-    d2[i[inside], j[inside]] = near[inside]
-    log_det[i[inside], j[inside]] = of_near[inside]
-    return d2, log_det
+    def _updated(self, g: Gaussian, d: Detection) -> tuple[Gaussian, float]:
+        """Return a state conditioned on a detection, and the squared Mahalanobis distance of
+        that."""
+        bias = self._bias[d.key.origin]
+        if g.covariance[bias, bias] == 0:  # the link's first
+            g = Gaussian(g.mean, g.covariance.copy())
+            g.covariance[bias, bias] = d.bias_std**2
+        uav = Gaussian(g.mean[None, :STATES], g.covariance[None, :STATES, :STATES])
+        R = measurement_covariance(d.std, uav.mean[0])[None]
+        rows = np.flatnonzero(np.isfinite(d.measured))
+        left = narrowed(uav, R, d.own, d.sender) if rows.size == 4 else uav
+        R = (R + curvature(left, d.own, d.sender))[0][rows[:, None], rows]
+
+        def seen(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            off, H = self._residual(x, d)
+            return off[rows], H[rows]
+
+        y, H = seen(g.mean)
+        d2, _ = mahalanobis(y[None], (H @ g.covariance @ H.T + R)[None])
+        return conditioned(g, R, seen), float(d2[0])
+
+    def _residual(self, x: np.ndarray, d: Detection) -> tuple[np.ndarray, np.ndarray]:
+        """Return a detection less what is expected of a state (S,), (4,), and the latter's
+        derivatives (4, S)."""
+        tx, _, rx = d.key.origin.partition("->")
+        own, sender, mine = d.own, d.sender, self._pose[rx]
+        H = np.zeros((4, x.size))
+        H[:, :STATES] = jacobian(x[:STATES], own, sender)
+        segment = H[:, :SIZE]
+        if sender is not None:
+            of_sender = transmitter_jacobian(x[:STATES], sender)
+            segment = segment + of_sender
+            H[:, self._pose[tx] : self._pose[tx] + SIZE] = of_sender
+        H[:, mine : mine + SIZE] = -segment
+        e = (x[:3] - own.position) / np.linalg.norm(x[:3] - own.position)
+        # R^T (I - [a]) e = R^T e + R^T [e] a, for an attitude that is off by a
+        H[2:, mine + SIZE : mine + POSE_ERRORS] = own.rotation.T[[0, 2]] @ cross(e)
+        H[0, self._bias[d.key.origin]] = 1.0
+        return d.measured - measure(x[:STATES], own, sender) - H[:, STATES:] @ x[STATES:], H
 
 
 def cross(e: np.ndarray) -> np.ndarray:
@@ -423,144 +345,37 @@ def cross(e: np.ndarray) -> np.ndarray:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-@lru_cache(maxsize=8)
-def gate(probability: float) -> float:
-    """Squared distance within which two estimates of one UAV lie with a probability."""
-    return float(2 * gammaincinv(SIZE / 2, probability))
+def _starts(d: Detection) -> bool:
+    """Return whether a detection fixes a place."""
+    return bool(np.isfinite(resting(d.measured[None], d.own, d.sender)).all())
 
 
-@dataclass
-class _FusedUav:
-    name: Name
-    members: list[Key]
-
-    def origins(self) -> set[str]:
-        return {key.origin for key in self.members}
+@lru_cache(maxsize=256)
+def gate(probability: float, size: int = SIZE) -> float:
+    """Return the squared distance within which so many components lie with a probability."""
+    return float(2 * gammaincinv(size / 2, probability))
 
 
-@dataclass
-class FusedTracks(Stateful):
-    """Fused tracks of a listener over all tracks that it knows, with memory of which of them are
-    one target, and its name."""
+def distances(a: Sequence[Gaussian], b: Sequence[Gaussian]) -> np.ndarray:
+    """Return squared Mahalanobis distances (len(a), len(b)) plus ln det S, S = A + B; infinite
+    where the distance is outside the gate of `JOIN_PROBABILITY`.
 
-    uavs: list[_FusedUav] = field(default_factory=list)
-
-    def update(
-        self, reports: Iterable[Report], known: Mapping[str, Reported] | None = None
-    ) -> list[Fused]:
-        """The UAVs of one instant.
-
-        Parameters
-        ----------
-        reports : all of that instant (`at_once`), one per track
-        known : what terminals say of themselves (`report_of`), likewise
-        """
-        by_key = {report.key: report for report in reports}
-        whole = {key: report.whole for key, report in by_key.items()}
-        self._keep(whole, by_key)
-        self._join(whole)
-        self._unite(whole)
-        self._call(by_key)
-        known = known or {}
-        states = [intersection_of([whole[k] for k in b.members]) for b in self.uavs]
-        whose = recognise(states, {name: word.whole for name, word in known.items()})
-        itself = {k: (name, known[name]) for k, name in enumerate(whose) if name is not None}
-        if self.uavs:
-            members = [[by_key[k] for k in b.members] for b in self.uavs]
-            states = joint_states(members, itself)
-        return [
-            Fused(uav.name, in_datum(state), tuple(uav.members), terminal)
-            for uav, state, terminal in zip(self.uavs, states, whose, strict=True)
-        ]
-
-    def _keep(self, whole: Mapping[Key, Gaussian], by_key: Mapping[Key, Report]) -> None:
-        """UAVs of the tracks that are still there: those that have left their body, and new
-        ones, stand alone."""
-        kept, alone = [], dict.fromkeys(by_key)
-        for uav in self.uavs:
-            members = [key for key in uav.members if key in by_key]
-            if not members:
-                continue
-            if len(members) == 1:
-                uav.members = members
-                kept.append(uav)
-                del alone[members[0]]
-                continue
-            members.sort(key=lambda k: float(np.trace(whole[k].covariance)))
-            surely = SPLIT_PROBABILITY
-            d2, _ = distances([whole[members[0]]], [whole[k] for k in members], surely)
-            surest = {k.origin: k for k in reversed(members)}
-            gaps = [_gap(whole[k], whole[surest[k.origin]]) for k in members]
-            uav.members = [
-                k
-                for k, d, gap in zip(members, d2[0], gaps, strict=True)
-                if np.isfinite(d) and gap <= 2 * MIN_SEPARATION_M
-            ]
-            kept.append(uav)
-            for key in uav.members:
-                del alone[key]
-        self.uavs = kept + [_FusedUav(by_key[key].name, [key]) for key in alone]
-
-    def _join(self, whole: Mapping[Key, Gaussian]) -> None:
-        """Tracks that stand alone join UAVs that their terminal has no track of, origin by
-        origin: as many as the gate allows, of the greatest likelihood."""
-        for origin in dict.fromkeys(key.origin for key in sorted(whole)):
-            single = [b for b in self.uavs if len(b.members) == 1 and origin in b.origins()]
-            others = [b for b in self.uavs if origin not in b.origins()]
-            if not single:
-                continue
-            d2, log_det = distances(
-                [intersection_of([whole[k] for k in b.members]) for b in others],
-                [whole[b.members[0]] for b in single],
-                JOIN_PROBABILITY,
-            )
-            for i, j in assign(d2 + log_det):
-                others[i].members += single[j].members
-                others[i].name = min(others[i].name, single[j].name)
-                self.uavs.remove(single[j])
-
-    def _unite(self, whole: Mapping[Key, Gaussian]) -> None:
-        """UAVs of one terminal's tracks that lie nearer to each other than UAVs fly are one."""
-        states = [intersection_of([whole[k] for k in b.members]) for b in self.uavs]
-        d2, _ = distances(states, states, JOIN_PROBABILITY)
-        merged: set[int] = set()
-        for i, j in np.argwhere(np.tril(np.isfinite(d2), -1)).tolist():
-            if {i, j} & merged:
-                continue
-            uav, other = self.uavs[i], self.uavs[j]
-            pairs = product(uav.members, other.members)
-            gaps = [_gap(whole[a], whole[b]) for a, b in pairs if a.origin == b.origin]
-            if gaps and max(gaps) < MIN_SEPARATION_M:
-                other.members += uav.members
-                other.name = min(uav.name, other.name)
-                merged.add(i)
-        self.uavs = [b for i, b in enumerate(self.uavs) if i not in merged]
-
-    def _call(self, by_key: Mapping[Key, Report]) -> None:
-        """Names: the earliest that any member is known by; two UAVs never have the same. The one
-        with the track that the name is of keeps it, else the one that had it before."""
-        for uav in self.uavs:
-            uav.name = min(uav.name, *(by_key[key].name for key in uav.members))
-        holder: dict[Name, _FusedUav] = {}
-        waiting = sorted(self.uavs, key=lambda b: Key(*b.name[1:]) not in b.members)
-        for uav in waiting:
-            if uav.name in holder:
-                uav.name = min(by_key[key].own_name for key in uav.members)
-            if uav.name in holder:  # by a UAV that lacks the track; it takes its own in its turn
-                waiting.append(holder[uav.name])
-            holder[uav.name] = uav
-
-
-def _gap(a: Gaussian, b: Gaussian) -> float:
-    """Distance of two places [m]."""
-    return float(np.linalg.norm(a.mean[:3] - b.mean[:3]))
+    What the errors have in common makes the true S smaller, so that this gate lets in more than
+    its share.
+    """
+    out = np.full((len(a), len(b)), np.inf)
+    if not out.size:
+        return out
+    (x, P), (y, Q) = ([np.array(of) for of in zip(*some, strict=True)] for some in (a, b))
+    off = (x[:, None] - y).reshape(-1, SIZE)
+    d2, log_det = mahalanobis(off, (P[:, None] + Q).reshape(-1, SIZE, SIZE))
+    return np.where(d2 <= gate(JOIN_PROBABILITY), d2 + log_det, np.inf).reshape(out.shape)
 
 
 def recognise(states: Sequence[Gaussian], known: Mapping[str, Gaussian]) -> list[str | None]:
-    """The terminal that each UAV is, by what terminals say of themselves."""
+    """Return the terminal that each UAV is, by what terminals say of themselves."""
     whose: list[str | None] = [None] * len(states)
     names = list(known)
-    d2, log_det = distances(list(known.values()), states, JOIN_PROBABILITY)
-    for i, j in assign(d2 + log_det):
+    for i, j in assign(distances(list(known.values()), states)):
         whose[j] = names[i]
     return whose

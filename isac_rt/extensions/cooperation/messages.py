@@ -1,5 +1,5 @@
-"""Messages between terminals about tracks, and the time that a link takes to carry
-them.
+"""Messages between terminals about what their tracks detect, and the time that a link takes to
+carry them.
 
 An active terminal's messages ride on its data frames, a passive one's go back by its feedback. A
 message is made of what its sender knows after a frame and leaves with the next; it takes as many
@@ -9,21 +9,15 @@ an answer, and nothing is said twice unless it has changed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import ceil
 
 from isac_rt.extensions.city_receivers.out_of_sequence import BATCH
-from isac_rt.extensions.cooperation.fusion import (
-    FusedTracks,
-    Report,
-    Reported,
-    at_once,
-    report_of,
-)
+from isac_rt.extensions.cooperation.fusion import HOLD_S, Detection
 from isac_rt.plain import Stateful
 from isac_rt.track.filter import Gaussian
-from isac_rt.track.fused import Fused, Key, Name
+from isac_rt.track.fused import Key, Name
 
 HEADER_BITS = 64
 """Sender, time, length and checksum of a message."""
@@ -32,22 +26,22 @@ TERMINAL_BITS = 16 + 3 * 24 + 3 * 16
 second."""
 NUMBER_BITS = 16
 """One of the numbers of the tracks that a terminal keeps."""
-REPORT_BITS = 8 + 16 + 16 + 40 + 120 + 6 * 16 + 15 * 8 + 8
-"""A track: whose, number, age, name, mean (24 bits of each position, 16 of each velocity),
-deviations and correlations, and how far the clock moves it; what the errors of the pose do follows
-from the terminal's own place. What these bits round off is not modelled: a centimetre and less."""
+FRAME_BITS = 8 + 16 + 2 * (3 * 24 + 3 * 16) + 3 * 16 + 8
+"""A frame of a link whose detections follow: which link, age, position and velocity of receiver and
+transmitter, attitude, and what its ranges share."""
+DETECTION_BITS = 16 + 40 + 24 + 3 * 16 + 4 * 8
+"""A detection: number and name of its track, range, rate, two cosines, and their deviations. What
+these bits round off is not modelled: a centimetre and less."""
 CODE_RATE = 0.5
 """Share of an active terminal's bits that messages get; the rest protects them."""
 CORRECTED = 0.05
 """Largest share of a frame's bits wrong that such a code corrects: hard decisions at rate 1/2 reach
 some 0.06 with frames of two thousand bits."""
-HOLD_S = 0.5
-"""How long something that was said counts without being said again [s]."""
 
 
 @dataclass(frozen=True)
 class TrackNumbers:
-    """The numbers of all tracks that a link's receiver kept at a time [s], and by whom they were
+    """The numbers of all confirmed tracks of a link's receiver at a time [s], and by whom they were
     said: "" by the terminal itself."""
 
     time: float
@@ -73,25 +67,25 @@ class Message:
     sender : its name
     terminals : what it knows that terminals said of themselves, itself included
     kept : by link
-    reports : of tracks, its own and others'
-    left_out : tracks that were new and that it had no room for
+    detections : of its own tracks, and of others'
+    left_out : tracks that had new detections for which it had no room
     """
 
     sender: str
     terminals: Mapping[str, SelfReport]
     kept: Mapping[str, TrackNumbers]
-    reports: Sequence[Report]
+    detections: Sequence[Detection]
     left_out: int = 0
 
     @property
     def bits(self) -> int:
         """Its length."""
-        numbers = sum(len(kept.numbers) for kept in self.kept.values())
         return (
             HEADER_BITS
             + TERMINAL_BITS * len(self.terminals)
-            + NUMBER_BITS * numbers
-            + REPORT_BITS * len(self.reports)
+            + NUMBER_BITS * sum(len(kept.numbers) for kept in self.kept.values())
+            + FRAME_BITS * len({(d.key.origin, d.time) for d in self.detections})
+            + DETECTION_BITS * len(self.detections)
         )
 
 
@@ -144,36 +138,38 @@ class Channel(Stateful):
 
 @dataclass
 class Notes(Stateful):
-    """Tracks that a terminal knows from itself and from others, and what it has reported to whom.
+    """What a terminal knows from itself and from others, and what it has reported to whom.
 
     Attributes
     ----------
     name : of the terminal
-    reports : the latest of every track, and by whom each was said ("": its own)
-    kept : by link the tracks that its receiver keeps
+    detections : those of the last `HOLD_S` by track and time, and by whom each was said ("": its
+        own)
+    kept : by link the confirmed tracks of its receiver
+    since : times when its own tracks were confirmed [s]
     terminals : what they said of themselves
-    reported_to : by listener the time of each track's report that went there last [s]
-    fused_tracks : what it makes of all this
+    reported_to : by listener the time of each track's detection that went there last [s]
+    names : by which it knows the UAV of each track
     """
 
     name: str
-    reports: dict[Key, tuple[Report, str]] = field(default_factory=dict)
+    detections: dict[tuple[Key, float], tuple[Detection, str]] = field(default_factory=dict)
     kept: dict[str, TrackNumbers] = field(default_factory=dict)
+    since: dict[Key, float] = field(default_factory=dict)
     terminals: dict[str, SelfReport] = field(default_factory=dict)
     reported_to: dict[str, dict[Key, float]] = field(default_factory=dict)
-    fused_tracks: FusedTracks = field(default_factory=FusedTracks)
+    names: dict[Key, Name] = field(default_factory=dict)
 
-    def observe(self, origin: str, time: float, tracks: Mapping[int, Reported]) -> None:
-        """Take down the tracks of one of its own links after a frame, by their numbers; tracks that
-        were there before have begun before."""
-        mine = [key for key in self.reports if key.origin == origin]
-        before = {key: self.reports.pop(key)[0] for key in mine}
-        for number, (state, lever) in tracks.items():
+    def observe(
+        self, origin: str, time: float, found: Iterable[Detection], confirmed: Iterable[int]
+    ) -> None:
+        """Take down what the tracks of one of its own links detected in a frame, tentative ones
+        too, and which of them are confirmed."""
+        self.kept[origin] = TrackNumbers(time, tuple(confirmed))
+        for number in self.kept[origin].numbers:
             key = Key(origin, number)
-            since = before[key].since if key in before else time
-            name = before[key].name if key in before else Name(since, *key)
-            self.reports[key] = Report(key, since, name, time, state, lever), ""
-        self.kept[origin] = TrackNumbers(time, tuple(tracks))
+            self.names.setdefault(key, Name(self.since.setdefault(key, time), *key))
+        self.detections |= {(d.key, d.time): (d, "") for d in found}
 
     def locate(self, time: float, state: Gaussian) -> None:
         """Take down where it is itself."""
@@ -183,68 +179,74 @@ class Notes(Stateful):
         """Take down what is newer than what it knows."""
         sender = message.sender
         for name, own_report in message.terminals.items():
-            if name != self.name and self._newer(own_report.time, self.terminals.get(name)):
+            if name != self.name and _newer(own_report, self.terminals.get(name)):
                 self.terminals[name] = replace(own_report, via=sender)
         for origin, kept in message.kept.items():
-            if self._newer(kept.time, self.kept.get(origin)):
+            if _newer(kept, self.kept.get(origin)):
                 self.kept[origin] = replace(kept, via=sender)
-        for report in message.reports:
-            known = self.reports.get(report.key)
-            if self._newer(report.time, None if known is None else known[0]):
-                self.reports[report.key] = report, sender
+        for d in message.detections:
+            self.detections.setdefault((d.key, d.time), (d, sender))
 
-    @staticmethod
-    def _newer(time: float, known: SelfReport | TrackNumbers | Report | None) -> bool:
-        return known is None or time > known.time
-
-    def fuse(self, time: float, acceleration_std: float) -> list[Fused]:
-        """Return the fused tracks at a time [s], after forgetting what has ended or was not said
-        for `HOLD_S`."""
-        self.reports = {k: r for k, r in self.reports.items() if self._counts(r[0], time)}
+    def forget(self, time: float) -> None:
+        """Forget what was not said again for `HOLD_S`."""
+        self.detections = {k: d for k, d in self.detections.items() if time - k[1] <= HOLD_S}
+        self.kept = {k: t for k, t in self.kept.items() if time - t.time <= HOLD_S}
         self.terminals = {k: s for k, s in self.terminals.items() if time - s.time <= HOLD_S}
-        fused = self.fused_tracks.update(
-            at_once((report for report, _ in self.reports.values()), time, acceleration_std),
-            {
-                name: report_of(own_report.state).after(time - own_report.time, acceleration_std)
-                for name, own_report in self.terminals.items()
-            },
-        )
-        for uav in fused:
-            for key in uav.members:
-                report, via = self.reports[key]
-                if report.name != uav.name:
-                    self.reports[key] = replace(report, name=uav.name), via
-        return fused
 
-    def _counts(self, report: Report, time: float) -> bool:
-        kept = self.kept.get(report.key.origin)
-        ended = (
-            kept is not None and kept.time >= report.time and report.key.number not in kept.numbers
-        )
-        return not ended and time - report.time <= HOLD_S
+    def of_tracks(self, own: bool = False) -> tuple[set[Key], list[Detection]]:
+        """Return the confirmed tracks that it knows of, and their detections by the names that it
+        knows: of all, or its own alone."""
+        keys = {
+            Key(origin, number)
+            for origin, kept in self.kept.items()
+            for number in kept.numbers
+            if not (own and kept.via)
+        }
+        return keys, [
+            d._replace(since=self.since.get(d.key, d.since), name=self.names.get(d.key, d.name))
+            for d, _ in self.detections.values()
+            if d.key in keys
+        ]
 
     def compose(self, listener: str, capacity: int) -> Message:
         """Compose the message to a listener over a channel of `capacity` bits a frame: nothing that
-        came from there, and first the tracks that were not reported for longest. One frame's fill,
-        but one track at least."""
+        came from there, of each track the newest detection first, and first the tracks that were
+        not reported for longest. One frame's fill, but one detection at least."""
         reported_to = self.reported_to.setdefault(listener, {})
-        bare = Message(
+        message = Message(
             self.name,
             {k: s for k, s in self.terminals.items() if listener not in (k, s.via)},
             {k: s for k, s in self.kept.items() if s.via != listener},
             [],
         )
-        new = [
-            report
-            for report, via in self.reports.values()
-            if via != listener and report.time > reported_to.get(report.key, -1.0)
+        new: dict[Key, list[Detection]] = {}
+        for d in sorted(self.of_tracks()[1], key=lambda d: -d.time):
+            if self.detections[d.key, d.time][1] != listener:
+                if d.time > reported_to.get(d.key, -1.0):
+                    new.setdefault(d.key, []).append(d)
+        ranked = [
+            (rank, reported_to.get(key, -1.0), key, d)
+            for key, found in new.items()
+            for rank, d in enumerate(found)
         ]
-        new.sort(key=lambda report: (reported_to.get(report.key, -1.0), report.key))
-        capacity_left = ceil(bare.bits / capacity) * capacity - bare.bits
-        chosen = new[: max(1, capacity_left // REPORT_BITS)]
-        reported_to |= {report.key: report.time for report in chosen}
-        return replace(bare, reports=chosen, left_out=len(new) - len(chosen))
+        room = ceil(message.bits / capacity) * capacity
+        for *_, key, d in sorted(ranked, key=lambda r: r[:3]):
+            longer = replace(message, detections=[*message.detections, d])
+            if longer.bits <= room or not message.detections:
+                message = longer
+                reported_to[key] = max(reported_to.get(key, -1.0), d.time)
+        told = {d.key for d in message.detections}
+        return replace(message, left_out=len(new.keys() - told))
 
     def ages(self, time: float) -> tuple[float, ...]:
-        """Return the ages of what others reported and is still valid [s]."""
-        return tuple(time - report.time for report, via in self.reports.values() if via)
+        """Return the ages of the newest detection of each track that others reported [s]."""
+        newest: dict[Key, float] = {}
+        for (key, at), (_, via) in self.detections.items():
+            if via:
+                newest[key] = max(at, newest.get(key, at))
+        return tuple(time - at for at in newest.values())
+
+
+def _newer(word: SelfReport | TrackNumbers, known: SelfReport | TrackNumbers | None) -> bool:
+    """Return whether a word is newer than what is known."""
+    return known is None or word.time > known.time

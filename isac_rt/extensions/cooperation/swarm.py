@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from isac_rt.extensions.cooperation.fusion import FusedTracks, advance, at_once, in_world, report_of
+from isac_rt.extensions.cooperation.fusion import Detection, FusedTracks
 from isac_rt.extensions.cooperation.messages import CODE_RATE, CORRECTED, Channel, Notes
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
@@ -22,9 +22,11 @@ from isac_rt.results.scoring import LinkResult
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
 from isac_rt.simulation.stations import PREFETCHED_FRAMES
-from isac_rt.track.fused import Fused
+from isac_rt.track.filter import Ambiguity, Gaussian, predict, wrapped
+from isac_rt.track.fused import Fused, Key, Name
 from isac_rt.track.parts import ReportedUav, of_itself
 from isac_rt.track.reference import TerminalState
+from isac_rt.track.tracker import Track, in_plane
 from isac_rt.world.swarm import Pose
 
 SURELY = 0.99
@@ -55,16 +57,18 @@ class Cooperation(Stateful):
         self._names = list(dict.fromkeys(link.rx for link in links))
         s = setup.scenario
         self._notes = {name: Notes(name) for name in self._names}
-        self._swarm = FusedTracks()
-        self.state = Talk()
         self._acceleration = s.tracking.acceleration_std_mps2
+        self._fused = {
+            name: FusedTracks(self._names, list(map(str, links)), self._acceleration)
+            for name in [*self._names, SWARM]
+        }
+        self.state = Talk()
         self._feedback = int(s.access.feedback_rate_bps * setup.timetable.interval)
 
     @property
     def parts(self) -> Mapping[str, Stateful | None]:
-        return {f"notes of {name}": notes for name, notes in self._notes.items()} | {
-            "swarm": self._swarm
-        }
+        notes = {f"notes of {name}": notes for name, notes in self._notes.items()}
+        return notes | {f"fused {name}": fused for name, fused in self._fused.items()}
 
     def step(
         self,
@@ -94,7 +98,7 @@ class Cooperation(Stateful):
         views = {
             name: View(
                 time,
-                tuple(notes.fuse(time, self._acceleration)),
+                tuple(self._fuse(name, time)),
                 notes.ages(time),
                 traffic[name],
             )
@@ -111,11 +115,29 @@ class Cooperation(Stateful):
         self._send(frame)
         return {**views, SWARM: View(time, tuple(swarm_view))}
 
+    def _fuse(self, name: str, time: float) -> list[Fused]:
+        """Return the fused tracks of a terminal at a time [s], and let it know the UAVs by their
+        names."""
+        notes = self._notes[name]
+        notes.forget(time)
+        keys, detections = notes.of_tracks()
+        known = {
+            other: self._coasted(s.state, time - s.time) for other, s in notes.terminals.items()
+        }
+        fused = self._fused[name].update(time, detections, keys, known)
+        notes.names |= {key: uav.name for uav in fused for key in uav.members}
+        return fused
+
+    def _coasted(self, state: Gaussian, interval: float) -> Gaussian:
+        """Return a position and velocity (6,) after an interval [s], of an unknown acceleration."""
+        g = predict(Track.of_state(state, self._acceleration).state, interval, self._acceleration)
+        return Gaussian(g.mean[:6], g.covariance[:6, :6])
+
     def _reported_uavs(self, name: str, view: View, time: float) -> list[ReportedUav]:
         """Return the targets that a terminal knows of: other terminals by their reports, and the
         fused tracks that are none of these."""
         terminals = [
-            ReportedUav(other, advance(s.state, time - s.time, self._acceleration))
+            ReportedUav(other, self._coasted(s.state, time - s.time))
             for other, s in self._notes[name].terminals.items()
         ]
         return terminals + [ReportedUav("", b.state) for b in view.fused if b.terminal is None]
@@ -125,7 +147,7 @@ class Cooperation(Stateful):
         ends; none where the frame is not remembered."""
         then, known = self.state.known.get(frame, (time, {}))
         return [
-            uav._replace(state=advance(uav.state, time - then, self._acceleration))
+            uav._replace(state=self._coasted(uav.state, time - then))
             for uav in known.get(link.rx, [])
             if uav.terminal not in link
         ]
@@ -133,14 +155,8 @@ class Cooperation(Stateful):
     def _all_together(self, frame: int, time: float, poses: Mapping[str, Pose]) -> list[Fused]:
         """Return what all terminals know together at a time [s], without what is `_refuted`."""
         known = {name: of_itself(poses[name]) for name in self._notes}
-        own = [
-            report
-            for notes in self._notes.values()
-            for report, via in notes.reports.values()
-            if not via
-        ]
-        words = {name: report_of(state) for name, state in known.items()}
-        fused = self._swarm.update(at_once(own, time, self._acceleration), words)
+        keys, detections = map(list, zip(*(n.of_tracks(own=True) for n in self._notes.values())))
+        fused = self._fused[SWARM].update(time, sum(detections, []), set().union(*keys), known)
         return [uav for uav in fused if not self._refuted(uav, frame, poses)]
 
     def _refuted(self, uav: Fused, frame: int, poses: Mapping[str, Pose]) -> bool:
@@ -177,17 +193,28 @@ class Cooperation(Stateful):
         return sees.clutter_free(float(snr)) > SURELY
 
     def _observe(self, frame: int, link: Link, received: LinkResult) -> None:
-        """A terminal takes down the confirmed tracks of one of its links."""
+        """A terminal takes down what the tracks of one of its links detected."""
         setup, tracks = self._setup.of(link.tx), received.tracks
-        time = setup.timetable.epoch(frame, link.tx)
-        own = setup.believed(link.rx, setup.swarm.trajectories[link.rx].pose(time))
-        clock = 0.0
+        time, w = setup.timetable.epoch(frame, link.tx), setup.waveform
+        own, there = (
+            setup.believed(n, setup.swarm.trajectories[n].pose(time)) for n in (link.rx, link.tx)
+        )
+        transmitter, bias = np.zeros(0), 0.0
         if not link.own:
-            clock = SPEED_OF_LIGHT * setup.connections.offset_std(link, time)
-        confirmed = (tracks.confirmed & ~tracks.is_reference).nonzero()[0]
-        cell = setup.waveform.range_cell(1)
-        states = {int(tracks.ids[k]): in_world(tracks, int(k), own, clock, cell) for k in confirmed}
-        self._notes[link.rx].observe(str(link), time, states)
+            transmitter = of_itself(there).mean
+            bias = SPEED_OF_LIGHT * setup.connections.offset_std(link, time)
+        reflectors = tracks.select(~tracks.is_reference)
+        hit = reflectors.select(reflectors.detection >= 0)
+        found = in_plane(received.reception.detections).select(hit.detection)
+        expected = hit.measured
+        z = expected + wrapped(found.measured - expected, Ambiguity.of(w, link.passes))
+        none = Name(time, "", 0)
+        detections = [
+            Detection(Key(str(link), int(number)), time, none, time, own, transmitter, bias, *of)
+            for number, *of in zip(hit.ids, z, found.std, strict=True)
+        ]
+        confirmed = reflectors.ids[reflectors.confirmed].tolist()
+        self._notes[link.rx].observe(str(link), time, detections, confirmed)
 
     def _capacities(self, frame: int) -> dict[Link, int]:
         """Bits that each way from terminal to terminal has for messages in a frame: an active
