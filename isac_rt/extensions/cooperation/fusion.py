@@ -302,14 +302,16 @@ class FusedTracks(Stateful):
         """Return a state conditioned on a detection, and the squared Mahalanobis distance of
         that."""
         bias = self._bias[d.key.origin]
-        if g.covariance[bias, bias] == 0:  # the link's first
+        if d.bias_std and g.covariance[bias, bias] == 0:  # the link's first
             g = Gaussian(g.mean, g.covariance.copy())
             g.covariance[bias, bias] = d.bias_std**2
         uav = Gaussian(g.mean[None, :STATES], g.covariance[None, :STATES, :STATES])
         R = measurement_covariance(d.std, uav.mean[0])[None]
         rows = np.flatnonzero(np.isfinite(d.measured))
-        left = narrowed(uav, R, d.own, d.sender) if rows.size == 4 else uav
-        R = (R + curvature(left, d.own, d.sender))[0][rows[:, None], rows]
+        if g.covariance is not self._prior:
+            left = narrowed(uav, R, d.own, d.sender) if rows.size == 4 else uav
+            R = R + curvature(left, d.own, d.sender)
+        R = R[0][rows[:, None], rows]
 
         def seen(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             off, H = self._residual(x, d)

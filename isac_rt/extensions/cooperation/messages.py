@@ -219,24 +219,24 @@ class Notes(Stateful):
             {k: s for k, s in self.kept.items() if s.via != listener},
             [],
         )
-        new: dict[Key, list[Detection]] = {}
+        found: dict[Key, list[Detection]] = {}
         for d in sorted(self.of_tracks()[1], key=lambda d: -d.time):
             if self.detections[d.key, d.time][1] != listener:
-                if d.time > reported_to.get(d.key, -1.0):
-                    new.setdefault(d.key, []).append(d)
+                found.setdefault(d.key, []).append(d)
         ranked = [
-            (rank, reported_to.get(key, -1.0), key, d)
-            for key, found in new.items()
-            for rank, d in enumerate(found)
+            (d.time <= reported_to.get(key, -1.0), rank, reported_to.get(key, -1.0), key, d)
+            for key, all_of in found.items()
+            for rank, d in enumerate(all_of)
         ]
         room = ceil(message.bits / capacity) * capacity
-        for *_, key, d in sorted(ranked, key=lambda r: r[:3]):
+        for again, *_, key, d in sorted(ranked, key=lambda r: r[:4]):
             longer = replace(message, detections=[*message.detections, d])
-            if longer.bits <= room or not message.detections:
+            if longer.bits <= room or not (message.detections or again):
                 message = longer
                 reported_to[key] = max(reported_to.get(key, -1.0), d.time)
+        new = {key for again, *_, key, _ in ranked if not again}
         told = {d.key for d in message.detections}
-        return replace(message, left_out=len(new.keys() - told))
+        return replace(message, left_out=len(new - told))
 
     def ages(self, time: float) -> tuple[float, ...]:
         """Return the ages of the newest detection of each track that others reported [s]."""

@@ -168,29 +168,27 @@ class Cooperation(Stateful):
         if uav.terminal is not None or {k.origin for k in uav.members} & set(map(str, own)):
             return False
         place = uav.state.mean[:3]
-        return any(self._would_detect(link, place, frame, poses) for link in own)
+        return any(self._detection_probability(link, place, frame, poses) > SURELY for link in own)
 
-    def _would_detect(
+    def _detection_probability(
         self, link: Link, place: np.ndarray, frame: int, poses: Mapping[str, Pose]
-    ) -> bool:
-        """Return whether an active terminal surely detects a small UAV at a place: in its field of
-        view and range, not occluded, by the radar equation in noise."""
+    ) -> float:
+        """Return the probability that an active terminal detects a small UAV at a place: 0 outside
+        its range or field of view and where it is occluded, else by the radar equation in noise."""
         s, pose = self._setup.of(link.tx), poses[link.rx]
         w, antennas = s.waveform, s.arrays.of(link.rx)
         distance = float(np.linalg.norm(place - pose.position))
         towards = pose.to_body((place - pose.position) / distance)
-        if distance > w.num_range_cells * w.range_cell(2) or not antennas.in_view(towards):
-            return False
-        if s.walls.blocking(pose.position, place).size:
-            return False
+        far = distance > w.num_range_cells * w.range_cell(2)
+        if far or not antennas.in_view(towards) or s.walls.blocking(pose.position, place).size:
+            return 0.0
         section = 10 ** (SMALL_MEAN_DBSM / 10)
         amplitude = radar_amplitude(w.wavelength, section, distance, distance)
         sent, noise = s.transmission(link.tx, frame, pose), s.noise_power(dict(poses), link)
         sees = Sensitivity.of(
             w, antennas, s.scenario.receivers, sent, noise, w.num_groups, own=True
         )
-        snr = (amplitude * antennas.element_gain(towards)) ** 2 * sees.cell
-        return sees.clutter_free(float(snr)) > SURELY
+        return sees.clutter_free(float((amplitude * antennas.element_gain(towards)) ** 2 * sees.cell))
 
     def _observe(self, frame: int, link: Link, received: LinkResult) -> None:
         """A terminal takes down what the tracks of one of its links detected."""
