@@ -92,9 +92,30 @@ class Detection(NamedTuple):
         return Name(self.since, *self.key)
 
     @property
+    def order(self) -> tuple[float, Key]:
+        """Its place among all detections."""
+        return self.time, self.key
+
+    @property
+    def frame(self) -> tuple[float, str, list[bool]]:
+        """What detections have in common that are filtered at once: time, link, and the quantities
+        that were measured."""
+        return self.time, self.key.origin, np.isfinite(self.measured).tolist()
+
+    @property
     def sender(self) -> np.ndarray | None:
         """State of a passive terminal's transmitter."""
         return self.transmitter if self.transmitter.size else None
+
+
+class Instant(NamedTuple):
+    """State after a detection: its time [s], the UAV's 9 states with the errors of the terminals
+    and of the ranges of each link, and the squared Mahalanobis distance of the detection from what
+    was expected."""
+
+    time: float
+    state: Gaussian
+    test: float = 0.0
 
 
 @dataclass
@@ -106,39 +127,43 @@ class FusedUav:
     name : in the swarm
     members : tracks that are taken for it, with the name that each alone would give
     found : their detections of the last `HOLD_S`, in order of time
-    states : after each of them: the UAV's 9 states, the errors of the terminals and of the ranges
-        of each link
-    tests : squared Mahalanobis distance of each of them from what was expected
-    base : time [s] and state before the first of them; None: it starts the filter
+    states : after those that were filtered
+    base : what the first of them follows; None: it starts the filter
     """
 
     name: Name
     members: dict[Key, Name]
     found: list[Detection] = field(default_factory=list)
-    states: list[Gaussian] = field(default_factory=list)
-    tests: list[float] = field(default_factory=list)
-    base: tuple[float, Gaussian] | None = None
+    states: list[Instant] = field(default_factory=list)
+    base: Instant | None = None
+
+    @property
+    def latest(self) -> Instant | None:
+        """State after the last detection that was filtered."""
+        return self.states[-1] if self.states else self.base
+
+    @property
+    def next_found(self) -> Detection:
+        """Detection to be filtered next."""
+        return self.found[len(self.states)]
 
     def change(self, found: Iterable[Detection]) -> None:
         """Exchange the detections; those from the first that differs on are filtered again."""
-        new = sorted(found, key=lambda d: (d.time, d.key))
-        if self.base is not None:
-            new = [d for d in new if d.time >= self.base[0]]
-        same = 0
-        while same < min(len(new), len(self.states)) and new[same][:4:3] == self.found[same][:4:3]:
-            same += 1
+        since = -np.inf if self.base is None else self.base.time
+        new = sorted((d for d in found if d.time >= since), key=lambda d: d.order)
+        pairs = zip(new, self.found[: len(self.states)], strict=False)
+        same = next((k for k, (d, f) in enumerate(pairs) if d.order != f.order), len(new))
         self.found = new
-        del self.states[same:], self.tests[same:]
+        del self.states[same:]
 
     def worst(self) -> Key | None:
         """Return the track whose detections lie farthest beyond the gate of what is expected of
         this UAV; None: none does."""
         beyond = {}
         for key in self.members:
-            mine = [k for k, d in enumerate(self.found) if d.key == key]
-            size = sum(int(np.isfinite(self.found[k].measured).sum()) for k in mine)
-            if mine:
-                beyond[key] = sum(self.tests[k] for k in mine) / gate(SPLIT_PROBABILITY, size)
+            tests = [s.test for d, s in zip(self.found, self.states, strict=True) if d.key == key]
+            if tests:
+                beyond[key] = sum(tests) / gate(SPLIT_PROBABILITY, 4 * len(tests))
         key = max(beyond, key=lambda k: beyond[k], default=None)
         return key if key is not None and beyond[key] > 1 else None
 
@@ -192,9 +217,8 @@ class FusedTracks(Stateful):
             if d.key in kept and (d.key in by_key or _starts(d)):
                 by_key.setdefault(d.key, []).append(d)
         self._take(by_key, kept)
-        states = [self._at(uav, time) for uav in self.state.uavs]
-        states = self._part(states, time)
-        states = self._join(states, time)
+        self._part(time)
+        states = self._join(time)
         self._call(by_key)
         whose = recognise(states, known)
         return [
@@ -214,29 +238,24 @@ class FusedTracks(Stateful):
             if key not in known:
                 self.state.uavs.append(FusedUav(found[-1].name, {key: found[-1].own_name}, found))
 
-    def _part(self, states: list[Gaussian], time: float) -> list[Gaussian]:
+    def _part(self, time: float) -> None:
         """Make tracks whose detections are not those of their UAV UAVs of their own."""
-        uavs, out = self.state.uavs, list(states)
-        for k in range(len(uavs)):
-            key = uavs[k].worst()
-            if key is None:
-                continue
-            mine = [d for d in uavs[k].found if d.key == key]
-            if len(uavs[k].members) > 1:
-                own_name = uavs[k].members.pop(key)
-                uavs[k].change([d for d in uavs[k].found if d.key != key])
-                out[k] = self._at(uavs[k], time)
-                alone = FusedUav(own_name, {key: own_name}, mine)
-                uavs.append(alone)
-                out.append(self._at(alone, time))
-        return out
-
-    def _join(self, states: list[Gaussian], time: float) -> list[Gaussian]:
-        """Join UAVs that no terminal tells apart: as many as the gate allows, of the greatest
-        likelihood."""
         uavs = self.state.uavs
-        cost = distances(states, states)
+        self._at(uavs, time)
+        for uav in list(uavs):
+            key = uav.worst()
+            if key is not None and len(uav.members) > 1:
+                name, mine = uav.members.pop(key), [d for d in uav.found if d.key == key]
+                uav.change([d for d in uav.found if d.key != key])
+                uavs.append(FusedUav(name, {key: name}, mine))
+
+    def _join(self, time: float) -> list[Gaussian]:
+        """Join UAVs that no terminal tells apart, as many as the gate allows, of the greatest
+        likelihood, and return their states."""
+        uavs = self.state.uavs
+        states = self._at(uavs, time)
         origins = [{key.origin for key in uav.members} for uav in uavs]
+        cost = distances(states, states)
         for i, j in np.ndindex(cost.shape):
             if i >= j or origins[i] & origins[j]:
                 cost[i, j] = np.inf
@@ -247,9 +266,8 @@ class FusedTracks(Stateful):
                 uavs[i].members |= uavs[j].members
                 uavs[i].name = min(uavs[i].name, uavs[j].name)
                 uavs[i].change([*uavs[i].found, *uavs[j].found])
-                states[i] = self._at(uavs[i], time)
         self.state.uavs = [uav for k, uav in enumerate(uavs) if k not in gone]
-        return [g for k, g in enumerate(states) if k not in gone]
+        return self._at(self.state.uavs, time)
 
     def _call(self, by_key: Mapping[Key, list[Detection]]) -> None:
         """Give names: the earliest that any member is known by; two UAVs never have the same. The
@@ -266,85 +284,94 @@ class FusedTracks(Stateful):
                 waiting.append(holder[uav.name])
             holder[uav.name] = uav
 
-    def _at(self, uav: FusedUav, time: float) -> Gaussian:
-        """Return a UAV's position and velocity at a time [s], after filtering what is new among its
-        detections; those that are older than `HOLD_S` are let go."""
-        for k in range(len(uav.states), len(uav.found)):
-            d = uav.found[k]
-            before = (uav.found[k - 1].time, uav.states[k - 1]) if k else uav.base
-            if before is None:
-                mean = np.zeros(len(self._prior))
-                mean[:STATES] = resting(d.measured[None], d.own, d.sender)[0]
-                before = d.time, Gaussian(mean, self._prior)
-            g, test = self._updated(self._predicted(before[1], d.time - before[0]), d)
-            uav.states.append(g)
-            uav.tests.append(test)
-        while len(uav.found) and uav.found[0].time < time - HOLD_S:
-            uav.base = uav.found.pop(0).time, uav.states.pop(0)
-            del uav.tests[0]
-        last, g = (uav.found[-1].time, uav.states[-1]) if uav.found else uav.base
-        g = self._predicted(g, time - last)
-        return Gaussian(g.mean[:SIZE], g.covariance[:SIZE, :SIZE])
+    def _at(self, uavs: Sequence[FusedUav], time: float) -> list[Gaussian]:
+        """Return the positions and velocities of UAVs at a time [s], after filtering what is new
+        among their detections, those of a frame at once, and let go those that are older than
+        `HOLD_S`."""
+        while waiting := [uav for uav in uavs if len(uav.states) < len(uav.found)]:
+            first = min(uav.next_found.frame for uav in waiting)
+            now = [uav for uav in waiting if uav.next_found.frame == first]
+            after, tests = self._updated([(uav.latest, uav.next_found) for uav in now])
+            for uav, mean, P, test in zip(now, *after, tests, strict=True):
+                uav.states.append(Instant(first[0], Gaussian(mean, P), float(test)))
+        for uav in uavs:
+            while uav.found and uav.found[0].time < time - HOLD_S:
+                del uav.found[0]
+                uav.base = uav.states.pop(0)
+        means, covariances = self._predicted([uav.latest for uav in uavs if uav.latest], time)
+        states = zip(means[:, :SIZE], covariances[:, :SIZE, :SIZE], strict=True)
+        return [Gaussian(*of) for of in states]
 
-    def _predicted(self, g: Gaussian, interval: float) -> Gaussian:
-        """Return a state after an interval [s]; errors stay as they are."""
-        if interval == 0:
-            return g
-        F, Q = singer(interval, self._acceleration_std)
-        mean, P = g.mean.copy(), g.covariance.copy()
-        mean[:STATES] = F @ mean[:STATES]
-        P[:STATES] = F @ P[:STATES]
-        P[:, :STATES] = P[:, :STATES] @ F.T
-        P[:STATES, :STATES] += Q
+    def _predicted(self, before: Sequence[Instant], time: float) -> Gaussian:
+        """Return states (K, S) at a time [s]; errors stay as they are."""
+        if not before:
+            return Gaussian(np.zeros((0, SIZE)), np.zeros((0, SIZE, SIZE)))
+        mean, P = (np.array(of) for of in zip(*(b.state for b in before), strict=True))
+        still, uav = (np.eye(STATES), np.zeros((STATES, STATES))), slice(STATES)
+        intervals = [time - b.time for b in before]
+        model = [singer(t, self._acceleration_std) if t else still for t in intervals]
+        F, Q = (np.array(of) for of in zip(*model, strict=True))
+        mean[:, uav] = (F @ mean[:, uav, None])[..., 0]
+        P[:, uav] = F @ P[:, uav]
+        P[:, :, uav] = P[:, :, uav] @ np.swapaxes(F, 1, 2)
+        P[:, uav, uav] += Q
         return Gaussian(mean, P)
 
-    def _updated(self, g: Gaussian, d: Detection) -> tuple[Gaussian, float]:
-        """Return a state conditioned on a detection, and the squared Mahalanobis distance of
-        that."""
+    def _updated(
+        self, pairs: Sequence[tuple[Instant | None, Detection]]
+    ) -> tuple[Gaussian, np.ndarray]:
+        """Return states (K, S) conditioned on detections of one frame of a link, and their squared
+        Mahalanobis distances (K,). Without a state before it a detection starts one at rest."""
+        found = [d for _, d in pairs]
+        d, z, std = found[0], *(np.array([of[-k] for of in found]) for k in (2, 1))
+        rest = np.zeros((len(found), len(self._prior)))
+        rest[:, :STATES] = resting(z, d.own, d.sender)
+        before = [
+            b or Instant(d.time, Gaussian(mean, self._prior))
+            for (b, _), mean in zip(pairs, rest, strict=True)
+        ]
+        g = self._predicted(before, d.time)
         bias = self._bias[d.key.origin]
-        if d.bias_std and g.covariance[bias, bias] == 0:  # the link's first
-            g = Gaussian(g.mean, g.covariance.copy())
-            g.covariance[bias, bias] = d.bias_std**2
-        uav = Gaussian(g.mean[None, :STATES], g.covariance[None, :STATES, :STATES])
-        R = measurement_covariance(d.std, uav.mean[0])[None]
-        rows = np.flatnonzero(np.isfinite(d.measured))
-        if g.covariance is not self._prior:
-            left = narrowed(uav, R, d.own, d.sender) if rows.size == 4 else uav
-            R = R + curvature(left, d.own, d.sender)
-        R = R[0][rows[:, None], rows]
+        unknown = g.covariance[:, bias, bias] == 0  # the link's first
+        g.covariance[unknown, bias, bias] = [of.bias_std**2 for of in found] * unknown
+        rows = np.flatnonzero(np.isfinite(z[0]))
+        uav = Gaussian(g.mean[:, :STATES], g.covariance[:, :STATES, :STATES])
+        R = measurement_covariance(std, uav.mean)
+        left = narrowed(uav, R, d.own, d.sender) if rows.size == 4 else uav
+        known = np.array([b is not None for b, _ in pairs])[:, None, None]
+        R = (R + known * curvature(left, d.own, d.sender))[:, rows[:, None], rows]
+
+        errors = self._levers(uav.mean, d)
 
         def seen(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            off, H = self._residual(x, d)
-            return off[rows], H[rows]
+            state = x[:, :STATES]
+            off = z - measure(state, d.own, d.sender) - (errors @ x[:, STATES:, None])[..., 0]
+            H = np.concatenate([jacobian(state, d.own, d.sender), errors], axis=2)
+            return off[:, rows], H[:, rows]
 
         y, H = seen(g.mean)
-        d2, _ = mahalanobis(y[None], (H @ g.covariance @ H.T + R)[None])
-        return conditioned(g, R, seen), float(d2[0])
+        d2, _ = mahalanobis(y, H @ g.covariance @ np.swapaxes(H, 1, 2) + R)
+        return conditioned(g, R, seen), d2
 
-    def _residual(self, x: np.ndarray, d: Detection) -> tuple[np.ndarray, np.ndarray]:
-        """Return a detection less what is expected of a state (S,), (4,), and the latter's
-        derivatives (4, S)."""
+    def _levers(self, uav: np.ndarray, d: Detection) -> np.ndarray:
+        """Return the derivatives (K, 4, E) of what is measured of UAVs (K, 9) in the frame of a
+        detection by the errors of terminals and links."""
         tx, _, rx = d.key.origin.partition("->")
-        own, sender, mine = d.own, d.sender, self._pose[rx]
-        H = np.zeros((4, x.size))
-        H[:, :STATES] = jacobian(x[:STATES], own, sender)
-        segment = H[:, :SIZE]
-        if sender is not None:
-            of_sender = transmitter_jacobian(x[:STATES], sender)
+        out = np.zeros((len(uav), 4, len(self._prior)))
+        segment = jacobian(uav, d.own, d.sender)[..., :SIZE]
+        if d.sender is not None:
+            of_sender = transmitter_jacobian(uav, d.sender)
             segment = segment + of_sender
-            H[:, self._pose[tx] : self._pose[tx] + SIZE] = of_sender
-        H[:, mine : mine + SIZE] = -segment
-        e = (x[:3] - own.position) / np.linalg.norm(x[:3] - own.position)
+            out[..., self._pose[tx] : self._pose[tx] + SIZE] = of_sender
+        mine = self._pose[rx]
+        out[..., mine : mine + SIZE] = -segment
+        e = uav[:, :3] - d.own.position
+        e /= np.linalg.norm(e, axis=1)[:, None]
         # R^T (I - [a]) e = R^T e + R^T [e] a, for an attitude that is off by a
-        H[2:, mine + SIZE : mine + POSE_ERRORS] = own.rotation.T[[0, 2]] @ cross(e)
-        H[0, self._bias[d.key.origin]] = 1.0
-        return d.measured - measure(x[:STATES], own, sender) - H[:, STATES:] @ x[STATES:], H
-
-
-def cross(e: np.ndarray) -> np.ndarray:
-    """(3, 3) matrix of the cross product with e from the left."""
-    x, y, z = e
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        turned = np.cross(d.own.rotation.T[[0, 2]], e[:, None])
+        out[:, 2:, mine + SIZE : mine + POSE_ERRORS] = turned
+        out[:, 0, self._bias[d.key.origin]] = 1.0
+        return out[..., STATES:]
 
 
 def _starts(d: Detection) -> bool:

@@ -188,7 +188,9 @@ class Cooperation(Stateful):
         sees = Sensitivity.of(
             w, antennas, s.scenario.receivers, sent, noise, w.num_groups, own=True
         )
-        return sees.clutter_free(float((amplitude * antennas.element_gain(towards)) ** 2 * sees.cell))
+        return sees.clutter_free(
+            float((amplitude * antennas.element_gain(towards)) ** 2 * sees.cell)
+        )
 
     def _observe(self, frame: int, link: Link, received: LinkResult) -> None:
         """A terminal takes down what the tracks of one of its links detected."""
