@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import dropwhile
 from typing import NamedTuple
 
 import numpy as np
@@ -150,7 +151,10 @@ class FusedUav:
     def change(self, found: Iterable[Detection]) -> None:
         """Exchange the detections; those from the first that differs on are filtered again."""
         since = -np.inf if self.base is None else self.base.time
-        new = sorted((d for d in found if d.time >= since), key=lambda d: d.order)
+        held = {d.order: d for d in found if d.time >= since}
+        new = [held[order] for order in sorted(held)]
+        if self.base is None:
+            new = list(dropwhile(lambda d: not _starts(d), new))
         pairs = zip(new, self.found[: len(self.states)], strict=False)
         same = next((k for k, (d, f) in enumerate(pairs) if d.order != f.order), len(new))
         self.found = new
@@ -214,8 +218,7 @@ class FusedTracks(Stateful):
         """
         by_key: dict[Key, list[Detection]] = {}
         for d in sorted(detections, key=lambda d: d.time):
-            if d.key in kept and (d.key in by_key or _starts(d)):
-                by_key.setdefault(d.key, []).append(d)
+            by_key.setdefault(d.key, []).append(d)
         self._take(by_key, kept)
         self._part(time)
         states = self._join(time)
@@ -230,13 +233,16 @@ class FusedTracks(Stateful):
         """Take up detections; tracks that have ended leave, and new ones are UAVs of their own."""
         for uav in self.state.uavs:
             uav.members = {key: name for key, name in uav.members.items() if key in kept}
-            own = [d for key in uav.members for d in by_key.get(key, ())]
-            uav.change([*own, *(d for d in uav.found if d.key not in uav.members)])
-        self.state.uavs = [uav for uav in self.state.uavs if uav.members]
+            uav.change([*uav.found, *(d for key in uav.members for d in by_key.get(key, ()))])
         known = {key for uav in self.state.uavs for key in uav.members}
         for key, found in by_key.items():
-            if key not in known:
-                self.state.uavs.append(FusedUav(found[-1].name, {key: found[-1].own_name}, found))
+            if key in kept and key not in known:
+                uav = FusedUav(found[-1].name, {key: found[-1].own_name})
+                uav.change(found)
+                self.state.uavs.append(uav)
+        self.state.uavs = [
+            uav for uav in self.state.uavs if uav.members and (uav.found or uav.base)
+        ]
 
     def _part(self, time: float) -> None:
         """Make tracks whose detections are not those of their UAV UAVs of their own."""
@@ -245,9 +251,10 @@ class FusedTracks(Stateful):
         for uav in list(uavs):
             key = uav.worst()
             if key is not None and len(uav.members) > 1:
-                name, mine = uav.members.pop(key), [d for d in uav.found if d.key == key]
-                uav.change([d for d in uav.found if d.key != key])
-                uavs.append(FusedUav(name, {key: name}, mine))
+                name, found = uav.members.pop(key), uav.found
+                uav.change([d for d in found if d.key != key])
+                uavs.append(FusedUav(name, {key: name}))
+                uavs[-1].change([d for d in found if d.key == key])
 
     def _join(self, time: float) -> list[Gaussian]:
         """Join UAVs that no terminal tells apart, as many as the gate allows, of the greatest
