@@ -55,9 +55,7 @@ HOLD_S = 0.5
 """How long a detection can be taken up in its order, and what was said counts without being said
 again [s]."""
 JOIN_PROBABILITY = 0.99
-SPLIT_PROBABILITY = 1 - 1e-6
-"""Two tracks are joined within the first gate and parted beyond the second, so that noise does not
-join and part them in turns."""
+"""Probability that two tracks of one UAV are joined."""
 
 
 class Detection(NamedTuple):
@@ -110,13 +108,11 @@ class Detection(NamedTuple):
 
 
 class Instant(NamedTuple):
-    """State after a detection: its time [s], the UAV's 9 states with the errors of the terminals
-    and of the ranges of each link, and the squared Mahalanobis distance of the detection from what
-    was expected."""
+    """State after a detection: its time [s], and the UAV's 9 states with the errors of the
+    terminals and of the ranges of each link."""
 
     time: float
     state: Gaussian
-    test: float = 0.0
 
 
 @dataclass
@@ -159,17 +155,6 @@ class FusedUav:
         same = next((k for k, (d, f) in enumerate(pairs) if d.order != f.order), len(new))
         self.found = new
         del self.states[same:]
-
-    def worst(self) -> Key | None:
-        """Return the track whose detections lie farthest beyond the gate of what is expected of
-        this UAV; None: none does."""
-        beyond = {}
-        for key in self.members:
-            tests = [s.test for d, s in zip(self.found, self.states, strict=True) if d.key == key]
-            if tests:
-                beyond[key] = sum(tests) / gate(SPLIT_PROBABILITY, 4 * len(tests))
-        key = max(beyond, key=lambda k: beyond[k], default=None)
-        return key if key is not None and beyond[key] > 1 else None
 
 
 @dataclass
@@ -220,7 +205,6 @@ class FusedTracks(Stateful):
         for d in sorted(detections, key=lambda d: d.time):
             by_key.setdefault(d.key, []).append(d)
         self._take(by_key, kept)
-        self._part(time)
         states = self._join(time)
         self._call(by_key)
         whose = recognise(states, known)
@@ -244,18 +228,6 @@ class FusedTracks(Stateful):
             uav for uav in self.state.uavs if uav.members and (uav.found or uav.base)
         ]
 
-    def _part(self, time: float) -> None:
-        """Make tracks whose detections are not those of their UAV UAVs of their own."""
-        uavs = self.state.uavs
-        self._at(uavs, time)
-        for uav in list(uavs):
-            key = uav.worst()
-            if key is not None and len(uav.members) > 1:
-                name, found = uav.members.pop(key), uav.found
-                uav.change([d for d in found if d.key != key])
-                uavs.append(FusedUav(name, {key: name}))
-                uavs[-1].change([d for d in found if d.key == key])
-
     def _join(self, time: float) -> list[Gaussian]:
         """Join UAVs that no terminal tells apart, as many as the gate allows, of the greatest
         likelihood, and return their states."""
@@ -277,19 +249,15 @@ class FusedTracks(Stateful):
         return self._at(self.state.uavs, time)
 
     def _call(self, by_key: Mapping[Key, list[Detection]]) -> None:
-        """Give names: the earliest that any member is known by; two UAVs never have the same. The
-        one with the track that the name is of keeps it, else the one that had it before."""
-        known = {key: found[-1] for key, found in by_key.items()}
+        """Give names: the earliest that any member is known by, but none that another UAV has, nor
+        one of another UAV's track."""
+        whose = {key: uav for uav in self.state.uavs for key in uav.members}
+        given: set[Name] = set()
         for uav in self.state.uavs:
-            uav.name = min([uav.name, *(known[key].name for key in uav.members if key in known)])
-        holder: dict[Name, FusedUav] = {}
-        waiting = sorted(self.state.uavs, key=lambda b: Key(*b.name[1:]) not in b.members)
-        for uav in waiting:
-            if uav.name in holder:
-                uav.name = min(uav.members.values())
-            if uav.name in holder:  # by a UAV that lacks the track; it takes its own in its turn
-                waiting.append(holder[uav.name])
-            holder[uav.name] = uav
+            told = [by_key[key][-1].name for key in uav.members if key in by_key]
+            names = {uav.name, *told, *uav.members.values()} - given
+            uav.name = min(n for n in names if whose.get(Key(*n[1:]), uav) is uav)
+            given.add(uav.name)
 
     def _at(self, uavs: Sequence[FusedUav], time: float) -> list[Gaussian]:
         """Return the positions and velocities of UAVs at a time [s], after filtering what is new
@@ -298,9 +266,9 @@ class FusedTracks(Stateful):
         while waiting := [uav for uav in uavs if len(uav.states) < len(uav.found)]:
             first = min(uav.next_found.frame for uav in waiting)
             now = [uav for uav in waiting if uav.next_found.frame == first]
-            after, tests = self._updated([(uav.latest, uav.next_found) for uav in now])
-            for uav, mean, P, test in zip(now, *after, tests, strict=True):
-                uav.states.append(Instant(first[0], Gaussian(mean, P), float(test)))
+            after = self._updated([(uav.latest, uav.next_found) for uav in now])
+            for uav, *state in zip(now, *after, strict=True):
+                uav.states.append(Instant(first[0], Gaussian(*state)))
         for uav in uavs:
             while uav.found and uav.found[0].time < time - HOLD_S:
                 del uav.found[0]
@@ -324,11 +292,9 @@ class FusedTracks(Stateful):
         P[:, uav, uav] += Q
         return Gaussian(mean, P)
 
-    def _updated(
-        self, pairs: Sequence[tuple[Instant | None, Detection]]
-    ) -> tuple[Gaussian, np.ndarray]:
-        """Return states (K, S) conditioned on detections of one frame of a link, and their squared
-        Mahalanobis distances (K,). Without a state before it a detection starts one at rest."""
+    def _updated(self, pairs: Sequence[tuple[Instant | None, Detection]]) -> Gaussian:
+        """Return states (K, S) conditioned on detections of one frame of a link. Without a state
+        before it a detection starts one at rest."""
         found = [d for _, d in pairs]
         d, z, std = found[0], *(np.array([of[-k] for of in found]) for k in (2, 1))
         rest = np.zeros((len(found), len(self._prior)))
@@ -339,8 +305,8 @@ class FusedTracks(Stateful):
         ]
         g = self._predicted(before, d.time)
         bias = self._bias[d.key.origin]
-        unknown = g.covariance[:, bias, bias] == 0  # the link's first
-        g.covariance[unknown, bias, bias] = [of.bias_std**2 for of in found] * unknown
+        variance = g.covariance[:, bias, bias]  # 0 before the link's first
+        g.covariance[:, bias, bias] = np.where(variance, variance, [of.bias_std**2 for of in found])
         rows = np.flatnonzero(np.isfinite(z[0]))
         uav = Gaussian(g.mean[:, :STATES], g.covariance[:, :STATES, :STATES])
         R = measurement_covariance(std, uav.mean)
@@ -356,9 +322,7 @@ class FusedTracks(Stateful):
             H = np.concatenate([jacobian(state, d.own, d.sender), errors], axis=2)
             return off[:, rows], H[:, rows]
 
-        y, H = seen(g.mean)
-        d2, _ = mahalanobis(y, H @ g.covariance @ np.swapaxes(H, 1, 2) + R)
-        return conditioned(g, R, seen), d2
+        return conditioned(g, R, seen)
 
     def _levers(self, uav: np.ndarray, d: Detection) -> np.ndarray:
         """Return the derivatives (K, 4, E) of what is measured of UAVs (K, 9) in the frame of a
@@ -387,9 +351,9 @@ def _starts(d: Detection) -> bool:
 
 
 @lru_cache(maxsize=256)
-def gate(probability: float, size: int = SIZE) -> float:
-    """Return the squared distance within which so many components lie with a probability."""
-    return float(2 * gammaincinv(size / 2, probability))
+def gate(probability: float) -> float:
+    """Return the squared distance within which two estimates of one UAV lie with a probability."""
+    return float(2 * gammaincinv(SIZE / 2, probability))
 
 
 def distances(a: Sequence[Gaussian], b: Sequence[Gaussian]) -> np.ndarray:

@@ -171,10 +171,6 @@ class Notes(Stateful):
             self.names.setdefault(key, Name(self.since.setdefault(key, time), *key))
         self.detections |= {(d.key, d.time): (d, "") for d in found}
 
-    def locate(self, time: float, state: Gaussian) -> None:
-        """Take down where it is itself."""
-        self.terminals[self.name] = SelfReport(time, state)
-
     def receive(self, message: Message) -> None:
         """Take down what is newer than what it knows."""
         sender = message.sender
@@ -193,15 +189,9 @@ class Notes(Stateful):
         self.kept = {k: t for k, t in self.kept.items() if time - t.time <= HOLD_S}
         self.terminals = {k: s for k, s in self.terminals.items() if time - s.time <= HOLD_S}
 
-    def of_tracks(self, own: bool = False) -> tuple[set[Key], list[Detection]]:
-        """Return the confirmed tracks that it knows of, and their detections by the names that it
-        knows: of all, or its own alone."""
-        keys = {
-            Key(origin, number)
-            for origin, kept in self.kept.items()
-            for number in kept.numbers
-            if not (own and kept.via)
-        }
+    def of_tracks(self) -> tuple[set[Key], list[Detection]]:
+        """Return the confirmed tracks, and their detections by the names that it knows."""
+        keys = {Key(origin, n) for origin, kept in self.kept.items() for n in kept.numbers}
         return keys, [
             d._replace(since=self.since.get(d.key, d.since), name=self.names.get(d.key, d.name))
             for d, _ in self.detections.values()

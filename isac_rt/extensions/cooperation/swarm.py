@@ -11,7 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from isac_rt.extensions.cooperation.fusion import JOIN_PROBABILITY, Detection, FusedTracks
-from isac_rt.extensions.cooperation.messages import CODE_RATE, CORRECTED, Channel, Notes
+from isac_rt.extensions.cooperation.messages import (
+    CODE_RATE,
+    CORRECTED,
+    Channel,
+    Notes,
+    SelfReport,
+)
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.plain import Stateful
@@ -32,6 +38,11 @@ from isac_rt.track.reference import TerminalState
 from isac_rt.track.tracker import Track, in_plane
 from isac_rt.world.swarm import Pose
 
+MASKED_CELLS = 3.0
+"""An echo that comes no more range cells than this behind a passive terminal's line of sight is
+pushed away from it: by the line's sidelobes, and by what is left where these were taken out."""
+PULL = 0.5
+"""Range cells of that push, which is alike from frame to frame."""
 CHANCE = 0.02
 """Share of the frames in which an active terminal detects something where there is no UAV but an
 artefact of passive ones: none in 34 frames of three cities. More than that a record never says."""
@@ -78,11 +89,11 @@ class Cooperation(Stateful):
         links = setup.timetable.all_links
         self._names = list(dict.fromkeys(link.rx for link in links))
         s = setup.scenario
-        self._notes = {name: Notes(name) for name in self._names}
+        self._notes = {name: Notes(name) for name in [*self._names, SWARM]}
         self._acceleration = s.tracking.acceleration_std_mps2
+        origins = [str(link) for link in links]
         self._fused = {
-            name: FusedTracks(self._names, list(map(str, links)), self._acceleration)
-            for name in [*self._names, SWARM]
+            name: FusedTracks(self._names, origins, self._acceleration) for name in self._notes
         }
         self.state = Talk()
         self._feedback = int(s.access.feedback_rate_bps * setup.timetable.interval)
@@ -113,31 +124,24 @@ class Cooperation(Stateful):
         traffic = self._carry(frame, received, symbols)
         self._carry_late(late, traffic)
         poses = {n: self._setup.believed(n, p) for n, p in self._setup.swarm.poses(time).items()}
-        for name, notes in self._notes.items():
-            notes.locate(time, of_itself(poses[name]))
+        for name in self._names:
+            for notes in (self._notes[name], self._notes[SWARM]):
+                notes.terminals[name] = SelfReport(time, of_itself(poses[name]))
         for link, result in received.items():
             self._observe(frame, link, result)
         views = {
-            name: View(
-                time,
-                tuple(self._fuse(name, time)),
-                notes.ages(time),
-                traffic[name],
-            )
+            name: View(time, self._fuse(name, time), notes.ages(time), traffic[name])
             for name, notes in self._notes.items()
         }
-        swarm_view = self._all_together(frame, time, poses, received)
-        self.state.known = {
-            k: v for k, v in self.state.known.items() if k > frame - PREFETCHED_FRAMES
+        views[SWARM] = View(time, self._existing(views[SWARM].fused, frame, poses, received))
+        known = self.state.known | {
+            frame: (time, {n: self._reported_uavs(n, views[n], time) for n in self._names})
         }
-        self.state.known[frame] = (
-            time,
-            {n: self._reported_uavs(n, views[n], time) for n in self._notes},
-        )
+        self.state.known = {k: v for k, v in known.items() if k > frame - PREFETCHED_FRAMES}
         self._send(frame)
-        return {**views, SWARM: View(time, tuple(swarm_view))}
+        return views
 
-    def _fuse(self, name: str, time: float) -> list[Fused]:
+    def _fuse(self, name: str, time: float) -> tuple[Fused, ...]:
         """Return the fused tracks of a terminal at a time [s], and let it know the UAVs by their
         names."""
         notes = self._notes[name]
@@ -148,7 +152,7 @@ class Cooperation(Stateful):
         }
         fused = self._fused[name].update(time, detections, keys, known)
         notes.names |= {key: uav.name for uav in fused for key in uav.members}
-        return fused
+        return tuple(fused)
 
     def _coasted(self, state: Gaussian, interval: float) -> Gaussian:
         """Return a position and velocity (6,) after an interval [s], of an unknown acceleration."""
@@ -174,61 +178,46 @@ class Cooperation(Stateful):
             if uav.terminal not in link
         ]
 
-    def _all_together(
+    def _existing(
         self,
+        fused: Sequence[Fused],
         frame: int,
-        time: float,
         poses: Mapping[str, Pose],
         received: Mapping[Link, LinkResult],
-    ) -> list[Fused]:
-        """Return what all terminals know together at a time [s], without what active ones should
-        have detected and did not."""
-        known = {name: of_itself(poses[name]) for name in self._notes}
-        keys, detections = set[Key](), list[Detection]()
-        for notes in self._notes.values():
-            mine, found = notes.of_tracks(own=True)
-            keys |= mine
-            detections += found
-        fused = self._fused[SWARM].update(time, detections, keys, known)
+    ) -> tuple[Fused, ...]:
+        """Return the swarm's UAVs without those that active terminals should have detected and did
+        not. A passive terminal's errors near the line of sight and over unknown paths are larger
+        than it knows: most tracks that it has alone are doubles of one that an active terminal has
+        elsewhere."""
         before, self.state.records = self.state.records, {}
-        out = []
-        for uav in fused:
-            odds = 0.0
-            for link in received:
-                if link.own and uav.terminal is None:
-                    record = before.get((uav.name, link), Record())
-                    record = self._recorded(record, uav, frame, link, received[link], poses)
-                    self.state.records[uav.name, link] = record
-                    odds += record.odds
-            if odds >= 0:
-                out.append(uav)
-        return out
+        odds = np.zeros(len(fused))
+        for link in received:
+            if not link.own:
+                continue
+            hits = self._hits(fused, link, received[link], poses[link.rx])
+            for k, (uav, hit) in enumerate(zip(fused, hits, strict=True)):
+                record, place = before.get((uav.name, link), Record()), uav.state.mean[:3]
+                tracked = str(link) in {key.origin for key in uav.members}
+                p = 1.0 if tracked else self._detection_probability(link, place, frame, poses)
+                if p > 0:
+                    record = record.after(p, tracked or hit)
+                self.state.records[uav.name, link] = record
+                odds[k] += record.odds
+        return tuple(b for b, of in zip(fused, odds, strict=True) if b.terminal or of >= 0)
 
-    def _recorded(
-        self,
-        record: Record,
-        uav: Fused,
-        frame: int,
-        link: Link,
-        received: LinkResult,
-        poses: Mapping[str, Pose],
-    ) -> Record:
-        """Return the record of a UAV at an active terminal after a frame: a hit if it has a track,
-        or a detection that no confirmed track of another UAV took. A passive terminal's errors near
-        the line of sight and over unknown paths are larger than it knows: most tracks that it has
-        alone are doubles of one that an active terminal has elsewhere."""
-        if str(link) in {key.origin for key in uav.members}:
-            return record.after(1.0, True)
-        probability = self._detection_probability(link, uav.state.mean[:3], frame, poses)
-        if probability == 0:
-            return record
-        found, tracks = in_plane(received.reception.detections), received.tracks
-        free = np.setdiff1d(np.arange(len(found)), tracks.detection[tracks.confirmed])
-        mean, S = expected(uav.state.mean[None], uav.state.covariance[None], poses[link.rx])
+    def _hits(
+        self, fused: Sequence[Fused], link: Link, received: LinkResult, own: Pose
+    ) -> np.ndarray:
+        """Return by UAV whether one of a frame's detections is more likely its own than another
+        UAV's."""
+        found = in_plane(received.reception.detections)
+        if not fused or not len(found):
+            return np.zeros(len(fused), bool)
+        states = (np.array(of) for of in zip(*(uav.state for uav in fused), strict=True))
         ambiguity = Ambiguity.of(self._setup.of(link.tx).waveform, link.passes)
-        z, std = found.measured[free], found.std[free]
-        cost = costs(z, std, mean, S, ambiguity, JOIN_PROBABILITY)
-        return record.after(probability, bool(np.isfinite(cost).any()))
+        z = *expected(*states, own), ambiguity, JOIN_PROBABILITY
+        cost = costs(found.measured, found.std, *z)
+        return (np.isfinite(cost) & (cost == cost.min(axis=0))).any(axis=1)
 
     def _detection_probability(
         self, link: Link, place: np.ndarray, frame: int, poses: Mapping[str, Pose]
@@ -256,25 +245,26 @@ class Cooperation(Stateful):
         """A terminal takes down what the tracks of one of its links detected."""
         setup, tracks = self._setup.of(link.tx), received.tracks
         time, w = setup.timetable.epoch(frame, link.tx), setup.waveform
-        own, there = (
-            setup.believed(n, setup.swarm.trajectories[n].pose(time)) for n in (link.rx, link.tx)
-        )
-        transmitter, bias = np.zeros(0), 0.0
-        if not link.own:
-            transmitter = of_itself(there).mean
-            bias = SPEED_OF_LIGHT * setup.connections.offset_std(link, time)
-        reflectors = tracks.select(~tracks.is_reference)
-        hit = reflectors.select(reflectors.detection >= 0)
+        own, there = (setup.believed(n, setup.swarm.trajectories[n].pose(time)) for n in link[::-1])
+        tracks = tracks.select(~tracks.is_reference)
+        hit = tracks.select(tracks.detection >= 0)
         found = in_plane(received.reception.detections).select(hit.detection)
-        there_ = hit.measured
-        z = there_ + wrapped(found.measured - there_, Ambiguity.of(w, link.passes))
-        none = Name(time, "", 0)
+        ambiguity = Ambiguity.of(w, link.passes)
+        z = hit.measured + wrapped(found.measured - hit.measured, ambiguity)
+        transmitter, bias = np.zeros(0), np.zeros(len(z))
+        if not link.own:
+            transmitter, cell = of_itself(there).mean, w.range_cell(1)
+            behind = z[:, 0] - np.linalg.norm(there.position - own.position)
+            clock = SPEED_OF_LIGHT * setup.connections.offset_std(link, time)
+            bias = np.hypot(clock, PULL * cell * (behind < MASKED_CELLS * cell))
         detections = [
-            Detection(Key(str(link), int(number)), time, none, time, own, transmitter, bias, *of)
-            for number, *of in zip(hit.ids, z, found.std, strict=True)
+            Detection(
+                Key(str(link), n), time, Name(time, str(link), n), time, own, transmitter, *of
+            )
+            for n, *of in zip(hit.ids.tolist(), bias.tolist(), z, found.std, strict=True)
         ]
-        confirmed = reflectors.ids[reflectors.confirmed].tolist()
-        self._notes[link.rx].observe(str(link), time, detections, confirmed)
+        for notes in (self._notes[link.rx], self._notes[SWARM]):
+            notes.observe(str(link), time, detections, tracks.ids[tracks.confirmed].tolist())
 
     def _capacities(self, frame: int) -> dict[Link, int]:
         """Bits that each way from terminal to terminal has for messages in a frame: an active
