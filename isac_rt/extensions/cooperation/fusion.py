@@ -55,7 +55,9 @@ HOLD_S = 0.5
 """How long a detection can be taken up in its order, and what was said counts without being said
 again [s]."""
 JOIN_PROBABILITY = 0.99
-"""Probability that two tracks of one UAV are joined."""
+SPLIT_PROBABILITY = 1 - 1e-6
+"""Two tracks are joined within the first gate and parted beyond the second, by all detections that
+are held, so that noise does not join and part them in turns."""
 
 
 class Detection(NamedTuple):
@@ -108,11 +110,13 @@ class Detection(NamedTuple):
 
 
 class Instant(NamedTuple):
-    """State after a detection: its time [s], and the UAV's 9 states with the errors of the
-    terminals and of the ranges of each link."""
+    """State after a detection: its time [s], the UAV's 9 states with the errors of the terminals
+    and of the ranges of each link, and the squared Mahalanobis distance of the detection from what
+    was expected."""
 
     time: float
     state: Gaussian
+    test: float = 0.0
 
 
 @dataclass
@@ -155,6 +159,15 @@ class FusedUav:
         same = next((k for k, (d, f) in enumerate(pairs) if d.order != f.order), len(new))
         self.found = new
         del self.states[same:]
+
+    def stranger(self) -> Key | None:
+        """Return the track whose detections lie farthest beyond `SPLIT_PROBABILITY` of what is
+        expected of this UAV; None: none does."""
+        beyond = {None: 1.0}
+        for key in self.members if len(self.members) > 1 else ():
+            tests = [s.test for d, s in zip(self.found, self.states, strict=True) if d.key == key]
+            beyond[key] = sum(tests) / gate(SPLIT_PROBABILITY, 4 * len(tests)) if tests else 0.0
+        return max(beyond, key=lambda key: beyond[key])
 
 
 @dataclass
@@ -205,6 +218,7 @@ class FusedTracks(Stateful):
         for d in sorted(detections, key=lambda d: d.time):
             by_key.setdefault(d.key, []).append(d)
         self._take(by_key, kept)
+        self._part(time)
         states = self._join(time)
         self._call(by_key)
         whose = recognise(states, known)
@@ -228,9 +242,21 @@ class FusedTracks(Stateful):
             uav for uav in self.state.uavs if uav.members and (uav.found or uav.base)
         ]
 
+    def _part(self, time: float) -> None:
+        """Make tracks whose detections are not those of their UAV UAVs of their own."""
+        self._at(self.state.uavs, time)
+        for uav in list(self.state.uavs):
+            key = uav.stranger()
+            if key is not None:
+                name, found = uav.members.pop(key), uav.found
+                alone = FusedUav(name, {key: name})
+                alone.change([d for d in found if d.key == key])
+                uav.change([d for d in found if d.key != key])
+                self.state.uavs.append(alone)
+
     def _join(self, time: float) -> list[Gaussian]:
         """Join UAVs that no terminal tells apart, as many as the gate allows, of the greatest
-        likelihood, and return their states."""
+        likelihood, where one filter fits the detections of both. Return the states."""
         uavs = self.state.uavs
         states = self._at(uavs, time)
         origins = [{key.origin for key in uav.members} for uav in uavs]
@@ -238,14 +264,18 @@ class FusedTracks(Stateful):
         for i, j in np.ndindex(cost.shape):
             if i >= j or origins[i] & origins[j]:
                 cost[i, j] = np.inf
-        gone: set[int] = set()
+        joined: set[int] = set()
         for i, j in assign(cost):
-            if not {i, j} & gone:
-                gone.add(j)
-                uavs[i].members |= uavs[j].members
-                uavs[i].name = min(uavs[i].name, uavs[j].name)
-                uavs[i].change([*uavs[i].found, *uavs[j].found])
-        self.state.uavs = [uav for k, uav in enumerate(uavs) if k not in gone]
+            if {i, j} & joined:
+                continue
+            a, b = uavs[i], uavs[j]
+            both = FusedUav(min(a.name, b.name), a.members | b.members, base=a.base)
+            both.change([*a.found, *b.found])
+            self._at([both], time)
+            if both.stranger() is None:
+                uavs[i] = uavs[j] = both
+                joined |= {i, j}
+        self.state.uavs = list({id(uav): uav for uav in uavs}.values())
         return self._at(self.state.uavs, time)
 
     def _call(self, by_key: Mapping[Key, list[Detection]]) -> None:
@@ -266,9 +296,9 @@ class FusedTracks(Stateful):
         while waiting := [uav for uav in uavs if len(uav.states) < len(uav.found)]:
             first = min(uav.next_found.frame for uav in waiting)
             now = [uav for uav in waiting if uav.next_found.frame == first]
-            after = self._updated([(uav.latest, uav.next_found) for uav in now])
-            for uav, *state in zip(now, *after, strict=True):
-                uav.states.append(Instant(first[0], Gaussian(*state)))
+            after, tests = self._updated([(uav.latest, uav.next_found) for uav in now])
+            for uav, mean, P, test in zip(now, *after, tests, strict=True):
+                uav.states.append(Instant(first[0], Gaussian(mean, P), float(test)))
         for uav in uavs:
             while uav.found and uav.found[0].time < time - HOLD_S:
                 del uav.found[0]
@@ -292,9 +322,11 @@ class FusedTracks(Stateful):
         P[:, uav, uav] += Q
         return Gaussian(mean, P)
 
-    def _updated(self, pairs: Sequence[tuple[Instant | None, Detection]]) -> Gaussian:
-        """Return states (K, S) conditioned on detections of one frame of a link. Without a state
-        before it a detection starts one at rest."""
+    def _updated(
+        self, pairs: Sequence[tuple[Instant | None, Detection]]
+    ) -> tuple[Gaussian, np.ndarray]:
+        """Return states (K, S) conditioned on detections of one frame of a link, and their squared
+        Mahalanobis distances (K,). Without a state before it a detection starts one at rest."""
         found = [d for _, d in pairs]
         d, z, std = found[0], *(np.array([of[-k] for of in found]) for k in (2, 1))
         rest = np.zeros((len(found), len(self._prior)))
@@ -322,7 +354,9 @@ class FusedTracks(Stateful):
             H = np.concatenate([jacobian(state, d.own, d.sender), errors], axis=2)
             return off[:, rows], H[:, rows]
 
-        return conditioned(g, R, seen)
+        y, H = seen(g.mean)
+        tests, _ = mahalanobis(y, H @ g.covariance @ np.swapaxes(H, 1, 2) + R)
+        return conditioned(g, R, seen), tests
 
     def _levers(self, uav: np.ndarray, d: Detection) -> np.ndarray:
         """Return the derivatives (K, 4, E) of what is measured of UAVs (K, 9) in the frame of a
@@ -351,9 +385,9 @@ def _starts(d: Detection) -> bool:
 
 
 @lru_cache(maxsize=256)
-def gate(probability: float) -> float:
-    """Return the squared distance within which two estimates of one UAV lie with a probability."""
-    return float(2 * gammaincinv(SIZE / 2, probability))
+def gate(probability: float, size: int = SIZE) -> float:
+    """Return the squared distance within which so many components lie with a probability."""
+    return float(2 * gammaincinv(size / 2, probability))
 
 
 def distances(a: Sequence[Gaussian], b: Sequence[Gaussian]) -> np.ndarray:
