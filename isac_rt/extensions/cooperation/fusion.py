@@ -73,8 +73,8 @@ class Detection(NamedTuple):
     transmitter : (6,) state of the transmitter of a passive terminal, as that reports it; (0,) at
         an active one
     bias_std : deviation of the error that all ranges of the track share [m]
-    measured, std : (4,) as in `isac_rt.track.filter.measure`, in the track's reading of an ambiguous
-        velocity, and their deviations
+    measured, std : (4,) as in `isac_rt.track.filter.measure`, in the track's reading of an
+        ambiguous velocity, and their deviations
     """
 
     key: Key
@@ -151,7 +151,7 @@ class FusedUav:
     def change(self, found: Iterable[Detection]) -> None:
         """Exchange the detections; those from the first that differs on are filtered again."""
         since = -np.inf if self.base is None else self.base.time
-        held = {d.order: d for d in found if d.time >= since}
+        held = {d.order: d for d in found if d.time > since}
         new = [held[order] for order in sorted(held)]
         if self.base is None:
             new = list(dropwhile(lambda d: not _starts(d), new))
@@ -163,7 +163,7 @@ class FusedUav:
     def stranger(self) -> Key | None:
         """Return the track whose detections lie farthest beyond `SPLIT_PROBABILITY` of what is
         expected of this UAV; None: none does."""
-        beyond = {None: 1.0}
+        beyond: dict[Key | None, float] = {None: 1.0}
         for key in self.members if len(self.members) > 1 else ():
             tests = [s.test for d, s in zip(self.found, self.states, strict=True) if d.key == key]
             beyond[key] = sum(tests) / gate(SPLIT_PROBABILITY, 4 * len(tests)) if tests else 0.0
@@ -339,14 +339,10 @@ class FusedTracks(Stateful):
         bias = self._bias[d.key.origin]
         variance = g.covariance[:, bias, bias]  # 0 before the link's first
         g.covariance[:, bias, bias] = np.where(variance, variance, [of.bias_std**2 for of in found])
-        rows = np.flatnonzero(np.isfinite(z[0]))
         uav = Gaussian(g.mean[:, :STATES], g.covariance[:, :STATES, :STATES])
-        R = measurement_covariance(std, uav.mean)
-        left = narrowed(uav, R, d.own, d.sender) if rows.size == 4 else uav
-        known = np.array([b is not None for b, _ in pairs])[:, None, None]
-        R = (R + known * curvature(left, d.own, d.sender))[:, rows[:, None], rows]
-
-        errors = self._levers(uav.mean, d)
+        R, errors = measurement_covariance(std, uav.mean), self._levers(uav.mean, d)
+        rows = np.flatnonzero(np.isfinite(z[0]))
+        ix = (slice(None), rows[:, None], rows)
 
         def seen(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             state = x[:, :STATES]
@@ -354,6 +350,12 @@ class FusedTracks(Stateful):
             H = np.concatenate([jacobian(state, d.own, d.sender), errors], axis=2)
             return off[:, rows], H[:, rows]
 
+        left = narrowed(uav, R, d.own, d.sender) if rows.size == 4 else uav
+        new = np.array([b is None for b, _ in pairs])
+        if new.any():  # a place that all of it fixes
+            of_all = conditioned(g, R[ix], seen).covariance[new, :STATES, :STATES]
+            left.covariance[new] = of_all
+        R = (R + curvature(left, d.own, d.sender))[ix]
         y, H = seen(g.mean)
         tests, _ = mahalanobis(y, H @ g.covariance @ np.swapaxes(H, 1, 2) + R)
         return conditioned(g, R, seen), tests

@@ -200,7 +200,7 @@ class Cooperation(Stateful):
                 tracked = str(link) in {key.origin for key in uav.members}
                 p = 1.0 if tracked else self._detection_probability(link, place, frame, poses)
                 if p > 0:
-                    record = record.after(p, tracked or hit)
+                    record = record.after(p, tracked or bool(hit))
                 self.state.records[uav.name, link] = record
                 odds[k] += record.odds
         return tuple(b for b, of in zip(fused, odds, strict=True) if b.terminal or of >= 0)
@@ -213,9 +213,11 @@ class Cooperation(Stateful):
         found = in_plane(received.reception.detections)
         if not fused or not len(found):
             return np.zeros(len(fused), bool)
-        states = (np.array(of) for of in zip(*(uav.state for uav in fused), strict=True))
+        means, covariances = (
+            np.array(of) for of in zip(*(uav.state for uav in fused), strict=True)
+        )
         ambiguity = Ambiguity.of(self._setup.of(link.tx).waveform, link.passes)
-        z = *expected(*states, own), ambiguity, JOIN_PROBABILITY
+        z = *expected(means, covariances, own), ambiguity, JOIN_PROBABILITY
         cost = costs(found.measured, found.std, *z)
         return (np.isfinite(cost) & (cost == cost.min(axis=0))).any(axis=1)
 
