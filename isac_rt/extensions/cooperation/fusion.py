@@ -94,13 +94,12 @@ class Detection(NamedTuple):
 
     @property
     def order(self) -> tuple[float, Key]:
-        """Its place among all detections."""
+        """Place among all detections."""
         return self.time, self.key
 
     @property
     def frame(self) -> tuple[float, str, list[bool]]:
-        """What detections have in common that are filtered at once: time, link, and the quantities
-        that were measured."""
+        """Time, link and measured quantities: detections that share them are filtered at once."""
         return self.time, self.key.origin, np.isfinite(self.measured).tolist()
 
     @property

@@ -138,7 +138,7 @@ class Channel(Stateful):
 
 @dataclass
 class Notes(Stateful):
-    """What a terminal knows from itself and from others, and what it has reported to whom.
+    """Knowledge of a terminal, its own and of others, and what it has reported to whom.
 
     Attributes
     ----------
