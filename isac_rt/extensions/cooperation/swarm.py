@@ -45,7 +45,7 @@ PULL = 0.5
 """Range cells of that push, which is alike from frame to frame."""
 CHANCE = 0.02
 """Share of the frames in which an active terminal detects something where there is no UAV but an
-artefact of passive ones: none in 39 frames of two cities, so that (0 + 1) / (39 + 2) is expected."""
+artefact of passive ones: none in 39 of two cities, so that (0 + 1) / (39 + 2) is expected."""
 
 
 class Record(NamedTuple):
