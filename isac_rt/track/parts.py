@@ -63,7 +63,7 @@ class Ownship:
     clutter_known : whether the clutter that it wants to know of is known
     reference : the track, or the report, of the transmitter on which all other tracks rest; None
         at an active terminal
-    tentative : numbers of the tracks that were not confirmed before this frame
+    tentative : numbers of the tracks that were not reported before this frame
     """
 
     pose: Pose
@@ -101,12 +101,12 @@ class TrackRule(Stateful):
         return detections
 
     def prune(self, tracker: Tracker, own: Ownship) -> None:
-        """End tracks of the frame, or take their confirmation back."""
+        """Doubt tracks, end them, or take their confirmation back."""
 
 
 def follow(tracker: Tracker, rules: Sequence[TrackRule], found: Detections, own: Ownship) -> None:
     """Update the tracks by what was `found` in a frame, and start and end them by the rules."""
-    tentative = frozenset(t.id for t in tracker.tracks if not t.confirmed)
+    tentative = frozenset(t.id for t in tracker.tracks if not t.credible)
     own = replace(own, tentative=tentative)
     for rule in rules:
         found = rule.candidates(found, own)

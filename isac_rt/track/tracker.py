@@ -266,6 +266,12 @@ class Tracker(Stateful):
         """End some tracks."""
         self.state.tracks = [t for t in self.tracks if t.id not in ids]
 
+    def doubt(self, ids: Container[int]) -> None:
+        """Take it that an artefact explains the detections of some tracks in this frame."""
+        for track in self.tracks:
+            if track.id in ids and track.detection >= 0:
+                track.odds += existence.EXPLAINED
+
     def predict(self, time: float) -> None:
         """Bring all tracks to `time` [s]."""
         for track in self.tracks:

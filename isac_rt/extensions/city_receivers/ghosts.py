@@ -17,7 +17,7 @@ terminal, as it tracks it; and whether one is that terminal itself over a wall.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -43,29 +43,17 @@ back."""
 ALIKE = 4.0
 """Factor in power within which the waves of such an echo are found, and over the noise from which
 on both are."""
-ECHOED_FRAMES = 3
-"""So many frames in a row a confirmed track fits a nearer UAV's echo, or lies behind a wall,
-before it ends: the UAV may be known only after its echo was confirmed, the place only then well
-enough, and a UAV may cross the place of another one's echo."""
 CROSSING_M = 3.0
-"""Confirmed tracks are held against the walls so near to them [m]: one that lay before all walls
-comes by here on its way behind one."""
+"""Tracks that were reported before are held against the walls so near to them [m]: one that lay
+before all walls comes by here on its way behind one."""
 ONE_WAY_SHARE = 2.0
 """The same for the direction of an echo over a wall on one way at an active terminal: its transmit
 antennas see another direction than its receive antennas, so that the halves of the virtual array do
 not join, and the receive antennas' resolution is twice as wide."""
 
 
-@dataclass
-class Echoed:
-    """Frames in a row in which a track fits a nearer target's echo over a wall, or lies behind one,
-    by its number."""
-
-    frames: dict[int, int] = field(default_factory=dict)
-
-
 class Ghosts(TrackRule):
-    """No track is confirmed, or kept for long, that walls explain.
+    """Tracks that walls explain are doubted, in each frame that shows them so.
 
     Parameters
     ----------
@@ -76,38 +64,32 @@ class Ghosts(TrackRule):
     def __init__(self, walls: Walls, leeway: Leeway) -> None:
         self._walls, self._leeway = walls, leeway
         self._alone = np.zeros(0, bool)
-        self.state = Echoed()
 
     def candidates(self, detections: Detections, own: Ownship) -> Detections:
         self._alone = alone(detections, self._leeway)
         return detections
 
     def prune(self, tracker: Tracker, own: Ownship) -> None:
-        """End the tracks, among those to be confirmed, that a wall explains, and of the others
-        those that are a nearer target's echoes over a wall frame after frame, or that went behind
-        one. Targets that others report have such echoes too."""
-        confirmed = {t.id for t in tracker.tracks if t.confirmed}
-        if not confirmed:
+        """Doubt the tracks that are a nearer target's echoes over a wall, of targets that others
+        report too, and those that lie behind one, which is asked where they are first to be
+        reported and where they pass one."""
+        credible = {t.id: t.state.mean[:3] for t in tracker.tracks if t.credible}
+        if not credible:
             return
         tracks = tracker.snapshot(own.pose, own.reference)
-        new = confirmed & own.tentative
-        crossing = {
-            t.id
-            for t in tracker.tracks
-            if t.id in confirmed - new and self._walls.within(t.state.mean[:3], CROSSING_M)
+        asked = {
+            number
+            for number, place in credible.items()
+            if number in own.tentative or self._walls.within(place, CROSSING_M)
         }
-        asked = np.isin(tracks.ids, [*(new | crossing)]) & ~tracks.is_reference
         reports = [Track.of_state(target.state) for target in own.reports]
         others = track_set(reports, own.pose, own.reference)
         single = (
             (tracks.detection >= 0) & self._alone[tracks.detection] if self._alone.size else None
         )
-        said = suspicion(tracks, own.pose, self._walls, self._leeway, others, asked, single)
-        suspect = set(tracks.ids[said.suspect].tolist())
-        before = self.state.frames
-        self.state.frames = {k: before.get(k, 0) + 1 for k in sorted(suspect)}
-        echoes = {k for k, frames in self.state.frames.items() if frames >= ECHOED_FRAMES}
-        tracker.drop(echoes | (suspect & new))
+        rows = np.isin(tracks.ids, [*asked]) & ~tracks.is_reference
+        said = suspicion(tracks, own.pose, self._walls, self._leeway, others, rows, single)
+        tracker.doubt(set(tracks.ids[said.suspect].tolist()))
 
 
 @dataclass(frozen=True)
