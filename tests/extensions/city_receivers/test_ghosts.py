@@ -201,9 +201,10 @@ def followed(tracker: Tracker, ghosts: Ghosts, reports: Sequence[Gaussian]) -> b
 
 
 def test_an_echo_is_doubted_once_its_body_is_known():
-    """An image that was reported before anybody knew of the body is reported no more from the second
-    frame on that knows of it, and a frame that does not counts for it again. Planted bugs: only
-    new tracks asked; doubted without a detection."""
+    """An image that was reported before anybody knew of the body ends to be reported in the
+    second frame that knows of it, nor is it later without: it lies behind the wall. A frame that
+    does not show it says nothing. Planted bugs: only new tracks asked; doubted without a
+    detection."""
     image = BODY[:3] * [-1, 1, 1] + [2 * WALL_X, 0, 0]
     w = Waveform()
     antennas = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
@@ -214,7 +215,7 @@ def test_an_echo_is_doubted_once_its_body_is_known():
     tracker.state.tracks = [one]
     ghosts = Ghosts(Walls(wall()), Leeway.of(w, antennas, 2))
     said = [followed(tracker, ghosts, known) for known in (body, body, body, body, [], [], [])]
-    assert said == [True, False, False, False, False, False, True]
+    assert said == [True, *[False] * 6]
     before, one.detection = one.odds, -1
     ghosts.prune(tracker, Ownship(OWN, 0.0, reports=[ReportedUav("", b) for b in body]))
     assert one.odds == before
