@@ -35,7 +35,7 @@ from isac_rt.track.filter import (
 )
 from isac_rt.track.fused import Fused, Key, Name
 from isac_rt.track.parts import POSE_STD
-from isac_rt.track.tracker import assign
+from isac_rt.track.tracker import CLEAR_M, assign
 from isac_rt.world.swarm import Pose
 
 SIZE = 6
@@ -256,14 +256,15 @@ class FusedTracks(Stateful):
                 self.state.uavs.append(alone)
 
     def _join(self, time: float) -> list[Gaussian]:
-        """Join UAVs that no terminal tells apart, as many as the gate allows, of the greatest
-        likelihood, where one filter fits the detections of both. Return the states."""
+        """Join UAVs of different terminals, or nearer than UAVs fly, as many as the gate allows, of
+        the greatest likelihood, where one filter fits the detections of both. Return the states."""
         uavs = self.state.uavs
         states = self._at(uavs, time)
         origins = [{key.origin for key in uav.members} for uav in uavs]
         cost = distances(states, states)
         for i, j in np.ndindex(cost.shape):
-            if i >= j or origins[i] & origins[j]:
+            near = np.linalg.norm(states[i].mean[:3] - states[j].mean[:3]) < CLEAR_M
+            if i >= j or (origins[i] & origins[j] and not near):
                 cost[i, j] = np.inf
         joined: set[int] = set()
         for i, j in assign(cost):

@@ -232,16 +232,20 @@ def test_two_terminals_that_see_one_uav_have_it_once_and_better():
 
 
 def test_uavs_of_one_terminal_or_farther_apart_than_their_errors_stay_two():
-    """Two tracks of one link 0.3 m apart; tracks of two links 4 m apart. Planted bugs: origins not
-    asked; any pair joined."""
-    near, far = beside(0.3), beside(4.0)
-    for link, at in (("A->A", near), ("A->B", far)):
+    """Two tracks of one link 0.7 m apart; tracks of two links 4 m apart. Nearer than UAVs fly, at
+    0.1 m, two tracks of one link are one UAV's. Planted bugs: origins not asked; always asked; any
+    pair joined."""
+    for link, at, count in (
+        ("A->A", beside(0.7), 2),
+        ("A->B", beside(4.0), 2),
+        ("A->A", beside(0.1), 1),
+    ):
         fused, every = tracks(), []
         for k in range(8):
             t = 0.05 * k
             every += [detection("A->A", t, 1), detection(link, t, 2, at=at)]
             found = fuse(fused, t, every)
-        assert len(found) == 2
+        assert len(found) == count
 
 
 def test_a_track_that_leaves_its_uav_is_parted():
