@@ -67,7 +67,7 @@ class ActiveReceiver:
         if self.settings.self_calibration == "none":
             return out
         measured = measure_channels(spectra, known, sensed.estimates, sensed.detections.snr)
-        return replace(out, path_channels=measured, neighbours=sensed.neighbours)
+        return replace(out, path_channels=measured)
 
 
 def receive_active(

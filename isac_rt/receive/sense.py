@@ -38,7 +38,6 @@ from isac_rt.receive.types import (
     Detections,
     Hints,
     Maps,
-    Neighbours,
     PathChannels,
 )
 
@@ -53,7 +52,7 @@ MAX_PATHS = 24
 @dataclass(frozen=True)
 class Sensed:
     """Detections of a frame with their estimates, strongest first, the map that they came from and
-    its background (`CfarRule.detect`). `sparse`, `correction`, `path_channels`, `neighbours`: see
+    its background (`CfarRule.detect`). `sparse`, `correction`, `path_channels`: see
     `Reception`."""
 
     estimates: list[Estimate]
@@ -63,7 +62,6 @@ class Sensed:
     sparse: bool | None = None
     correction: Correction | None = None
     path_channels: tuple[PathChannels, ...] = ()
-    neighbours: Neighbours | None = None
 
 
 class Detector(Protocol):

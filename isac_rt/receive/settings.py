@@ -91,8 +91,8 @@ class Receivers(Node):
     processes all."""
     self_calibration: Literal["none", "tracks", "positions"] = "none"
     """Whether terminals estimate and remove errors of their antennas, frame by frame. `none`, the
-    default. `tracks`: from tracked paths. `positions`: also from the terminals' reported positions
-    and the mesh's clutter, so that directions and clocks are found too."""
+    default. `tracks`: from tracked paths. `positions`: also from the terminals' reported positions,
+    so that directions and clocks are found too."""
 
     def problems(self) -> Iterator[Problem]:
         if self.refinement == "grid" and self.velocity_method == "pursuit":

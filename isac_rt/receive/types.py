@@ -171,24 +171,6 @@ class PathChannels:
     snr: float
 
 
-@dataclass(frozen=True)
-class Neighbours:
-    """By how much virtual channels differ in phase from their neighbours, as the frame's clutter
-    shows it.
-
-    Attributes
-    ----------
-    first, second : (Q,) int, channels by transmit antenna and then by receive antenna
-    phase, std : (Q,) of the second over the first beyond what the clutter's directions make, and
-        its standard deviation [rad]
-    """
-
-    first: np.ndarray
-    second: np.ndarray
-    phase: np.ndarray
-    std: np.ndarray
-
-
 @dataclass(frozen=True, kw_only=True)
 class Reception:
     """Output of one terminal's receiver for one frame.
@@ -223,8 +205,6 @@ class Reception:
         explains
     path_channels : what strong paths show of the channels, at a PT its reference alone; empty where
         `receivers.self_calibration` is none
-    neighbours : what clutter shows of the channels; None where nobody asks, or the detector does
-        not know the mesh
     """
 
     detections: Detections
@@ -242,7 +222,6 @@ class Reception:
     sparse: bool | None = None
     correction: Correction | None = None
     path_channels: tuple[PathChannels, ...] = ()
-    neighbours: Neighbours | None = None
     placed: bool = True
     intact: bool = True
 

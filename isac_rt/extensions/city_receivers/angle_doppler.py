@@ -14,7 +14,6 @@ import numpy as np
 
 from isac_rt.extensions.city_receivers.adaptive import DirectionTest, noise_level, unexplained
 from isac_rt.extensions.city_receivers.correction import fit
-from isac_rt.extensions.city_receivers.neighbours import phases
 from isac_rt.extensions.city_receivers.power import TAPER, Taper, expected_power
 from isac_rt.extensions.city_receivers.waves import waves_of
 from isac_rt.frame.antennas import resolutions
@@ -101,11 +100,7 @@ class AngleDoppler:
         kept = np.flatnonzero((number == 0) | ~repeated(detections, known))
         detections = replace(detections, starts=starts).select(kept)
         found = [found[i] for i in kept]
-        out = Sensed(found, detections, power, level, correction=correction)
-        if self.settings.self_calibration != "positions" or len(known.leaks) > 1:
-            return out
-        neighbours = phases(maps, test.expected, test.noise, known, clutter)
-        return replace(out, neighbours=neighbours)
+        return Sensed(found, detections, power, level, correction=correction)
 
     def test_cells(
         self, maps: np.ndarray, power: np.ndarray, known: Known, clutter: ExpectedClutter

@@ -45,7 +45,7 @@ class LearnedHardware(SelfCalibration):
             seen = known_lines_of_sight(
                 reception.path_channels, own.pose, own.reported_poses, reference.state
             )
-        change = self.learn_all(seen, reception.neighbours if self._passes == 2 else None)
+        change = self.learn_all(seen)
         if reference is not None:
             reference.state = seen_after(reference.state, own.pose, change, 1)
         for track in tracker.tracks:

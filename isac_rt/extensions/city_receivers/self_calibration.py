@@ -30,7 +30,7 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.arms import element_delays
 from isac_rt.receive.modes import MODES, polynomials
-from isac_rt.receive.types import Neighbours, PathChannels
+from isac_rt.receive.types import PathChannels
 from isac_rt.track.parts import HardwareModel
 
 GAIN_STD = 0.2, 0.6
@@ -56,9 +56,6 @@ LEAST_SNR = 1.0
 """Of a channel, under which a measured path says nothing."""
 LEAST_NOISE = 1e-4
 """Least noise of a channel over its power: what plane waves and seven range rows leave out."""
-LEAST_PHASE, MESH_PHASE = 0.01, 0.05
-"""Of neighbouring channels as clutter shows them [rad]: the least deviation that is believed, and
-what a mesh and the power of its scatterers are off by."""
 MISFIT = 1.5
 """Misfit beyond what chance makes, from which on a measured path counts for less."""
 
@@ -210,18 +207,12 @@ class SelfCalibration(HardwareModel):
 
     # ---- measured paths
 
-    def learn_all(
-        self,
-        seen: Sequence[tuple[PathChannels, KnownDirection]],
-        neighbours: Neighbours | None = None,
-    ) -> Change:
-        """Take in the measured paths of a frame and what clutter shows of neighbouring channels,
-        and say how paths are seen otherwise from now on."""
+    def learn_all(self, seen: Sequence[tuple[PathChannels, KnownDirection]]) -> Change:
+        """Take in the measured paths of a frame, and say how paths are seen otherwise from now
+        on."""
         before, clock = self.state.gains.value[1], self.state.clock
         for measured, known_direction in seen:
             self.learn(measured, known_direction)
-        if neighbours is not None:
-            self._learn_of_neighbours(neighbours)
         change = self.state.gains.value[1] - before
         _, across = self._steering(KnownDirection(np.zeros(2), np.inf, FREE))
         lines = np.linalg.pinv(np.hstack([self._amplitudes, across]))[-2:] @ self._elements
@@ -323,18 +314,6 @@ class SelfCalibration(HardwareModel):
         information = self.state.common_information + seen * weight.sum()
         self.state.common = self.state.common + new * (seen * weight.sum() / information)
         self.state.common_information = information
-
-    def _learn_of_neighbours(self, seen: Neighbours) -> None:
-        """Phases between channels, of which the frame's samples still hold what it has learnt."""
-        X = self._elements[seen.second] - self._elements[seen.first]
-        left = seen.phase - X @ (self.state.gains.value[1] - self._corrected.gains.value[1])
-        left = np.angle(np.exp(1j * left))
-        weight = 1 / (np.maximum(seen.std, LEAST_PHASE) ** 2 + MESH_PHASE**2)
-        own = self.state.gains.information
-        full = own[1] + (X.T * weight) @ X
-        step = np.linalg.solve(full, X.T @ (weight * left))
-        value = self.state.gains.value + np.stack([0 * step, step])
-        self.state.gains = Belief(value, np.stack([own[0], full]))
 
     def _learn_clock(
         self, measured: PathChannels, known_direction: KnownDirection, learnt: np.ndarray

@@ -10,7 +10,6 @@ from crb_model import bound, samples
 from receiver_cubes import ANTENNAS, Path, cube
 
 from isac_rt.extensions.city_receivers.known_paths import LearnedHardware, seen_after
-from isac_rt.extensions.city_receivers.neighbours import phases
 from isac_rt.extensions.city_receivers.self_calibration import (
     FREE,
     Change,
@@ -21,9 +20,8 @@ from isac_rt.frame.cube import IFCube
 from isac_rt.frame.payload import random_payload, unmodulated
 from isac_rt.frame.schedule import pseudo_random_schedule
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive.known import Known
 from isac_rt.receive.settings import Receivers
-from isac_rt.receive.types import ExpectedClutter, PathChannels
+from isac_rt.receive.types import PathChannels
 from isac_rt.storage import pack, unpack
 from isac_rt.track.filter import Gaussian
 from isac_rt.track.parts import Equipment
@@ -138,72 +136,6 @@ def test_tracked_directions_leave_what_turns_all_alike_and_nothing_else():
     assert np.std(left - line) < np.radians(1)
     assert np.std(line) > np.radians(3)
     assert np.std(np.log(np.abs(g / gains_of(one, 2)))) < 0.01
-
-
-def test_clutter_shows_phases_of_neighbours_however_wide_its_directions():
-    """Six thousand cells with four scatterers each, spread over half the view, 3 dB over the noise:
-    neighbours differ as their elements do, all directions off by 0.05 and -0.04 besides, within the
-    deviations that are stated, and so do the
-    phases of the elements that follow, in which a line along an arm is not left out. Planted bugs:
-    the conjugate of the expected coherence, neighbours taken the wrong way round."""
-    rng, waves = np.random.default_rng(6), replace(W, num_chirps=120, num_samples=256)
-    count, wave = 4 * 6000, 2 * np.pi * waves.effective_carrier / C
-    cells = rng.integers(20, 120, 6000), rng.integers(-60, 60, 6000)
-    row, bins = (np.repeat(one, 4) for one in cells)
-    rate = bins / (waves.effective_carrier * waves.frame_duration)
-    delay = row * waves.delay_step - rate * waves.effective_carrier / waves.slope
-    u = rng.uniform(-0.5, 0.5, (count, 2))
-    towards = np.stack([u[:, 0], np.sqrt(1 - (u**2).sum(axis=1)), u[:, 1]], axis=1)
-    clutter = ExpectedClutter(delay, rate, np.ones(count), towards, towards)
-    places = (ANTENNAS.tx_positions[:, None] + ANTENNAS.rx_positions).reshape(-1, 3)
-    tilt = np.exp(1j * wave * places @ np.array([0.05, 0.0, -0.04]))
-    g = (errors(rng, 3)[:, None] * errors(rng, 15)).ravel() * tilt
-    sums = np.bincount(row * 120 + bins % 120, minlength=128 * 120).reshape(128, 120)
-    frame = cube(waves, pseudo_random_schedule(3, 120, 3, rng), unmodulated(waves), [])
-    known = Known.of(frame, unmodulated(waves), ANTENNAS, 2)
-    one = SelfCalibration(W, ANTENNAS, 2)
-    for _ in range(4):
-        drawn = rng.normal(size=(count, 2)) @ np.array([1, 1j]) / np.sqrt(2)
-        maps = rng.normal(size=(45, 128, 120, 2)) @ np.array([1, 1j])
-        for channel, place_of in enumerate(places):
-            waved = g[channel] * drawn * np.exp(-1j * wave * towards @ place_of)
-            np.add.at(maps[channel], (row, bins), waved)
-        expected = np.fft.fftshift(sums, axes=1)
-        seen = phases(maps.reshape(3, 15, 128, 120), expected, 2.0, known, clutter)
-        off = np.angle(np.exp(1j * seen.phase) * (g[seen.first] / g[seen.second]))
-        assert seen.std.max() < 0.1
-        assert np.sqrt(np.mean((off / seen.std) ** 2)) < 1.5
-        one.learn_all([], seen)
-    left = np.angle(g * np.exp(-1j * one._elements @ one.state.gains.value[1]))
-    left = np.angle(np.exp(1j * (left - np.angle(np.exp(1j * left).sum()))))
-    lines = np.hstack([np.ones((45, 1)), wave * places[:, [0, 2]]])
-    line = np.linalg.lstsq(lines, left, rcond=None)[0]
-    assert np.std(left - lines @ line) < np.radians(2)
-    assert np.abs(line[1:]).max() < 0.012  # three deviations: 0.08 rad a pair, 15 pairs, 4 frames
-
-
-@pytest.mark.parametrize("rows", [[], [64, 65], [20, 64, 90]], ids=["none", "two rows", "three"])
-def test_clutter_in_hardly_a_cell_says_nothing_of_phases(rows):
-    """Clutter over the noise nowhere, or in two or three rows, of which nobody knows how they
-    scatter: the deviations are infinite, and no phase and no information of the elements changes.
-    Planted bug: the scatter of nothing is 0, so that phases of 0 are taken for sure."""
-    rng, waves = np.random.default_rng(8), replace(W, num_chirps=120, num_samples=256)
-    delay = np.repeat(np.array(rows, float) * waves.delay_step, 50)
-    towards = np.tile([0.1, np.sqrt(0.98), 0.1], (delay.size, 1))
-    ones = np.ones(delay.size)
-    clutter = ExpectedClutter(delay, 0 * ones, ones, towards, towards)
-    expected = np.zeros((128, 120))
-    expected[rows] = 5.0
-    frame = cube(waves, pseudo_random_schedule(3, 120, 3, rng), unmodulated(waves), [])
-    known = Known.of(frame, unmodulated(waves), ANTENNAS, 2)
-    maps = rng.normal(size=(3, 15, 128, 120, 2)) @ np.array([1, 1j])
-    seen = phases(maps, expected, 2.0, known, clutter)
-    assert np.isinf(seen.std).all()
-    one = SelfCalibration(W, ANTENNAS, 2)
-    before = one.state.gains
-    one.learn_all([], seen)
-    assert np.array_equal(one.state.gains.value, before.value)
-    assert np.array_equal(one.state.gains.information, before.information)
 
 
 def bent(values: np.ndarray, rng, schedule: np.ndarray) -> np.ndarray:
