@@ -316,11 +316,11 @@ def test_limbs_fade_as_the_path_to_them(traffic):
 @pytest.mark.slow
 def test_the_street_has_its_numbers():
     """One seed of the scene: the pedestrian is found where the car does not hide it, and the car's
-    tracks are its own and not false."""
+    one track or two are its own and not false."""
     figures = irt.run(irt.load(SCENES / "street_traffic.yaml"), snapshots=0).summary["links"]
     radar = figures["radar->radar"]
     assert radar["in_view"] == 20 and 0.45 <= radar["hit_rate"] <= 0.65
-    assert 3 < radar["object_tracks_per_frame"] < 7
+    assert 1 <= radar["object_tracks_per_frame"] < 2.5
     assert radar["false_tracks_per_frame"] < 0.7
 
 
@@ -337,5 +337,5 @@ def test_a_street_with_sumos_traffic_has_its_numbers():
     assert at["hit_rate"] == pytest.approx(0.75, abs=0.13)
     assert pt["hit_rate"] >= 0.9 and pt["ser_dpsk"] == pt["ser_delay"] == 0
     assert max(at["false_tracks_per_frame"], pt["false_tracks_per_frame"]) < 1.5
-    assert at["object_tracks_per_frame"] == pytest.approx(13, abs=4)
-    assert pt["object_tracks_per_frame"] == pytest.approx(9, abs=2)
+    assert at["object_tracks_per_frame"] == pytest.approx(7.6, abs=2)
+    assert pt["object_tracks_per_frame"] == pytest.approx(7.4, abs=2)
