@@ -35,8 +35,11 @@ SURE = log(200)
 """Most that a record says: a target may leave or hide."""
 
 
-def updated(odds: float, hit: bool, hits: int, frames: int) -> float:
-    """Return log-odds after a frame, by `hits` in the `frames` before it."""
-    found = (hits + 1) / (frames + 2)
-    said = log(found / RECURS) if hit else log((1 - found) / (1 - RECURS))
+def updated(
+    odds: float, hit: bool, hits: int, frames: int, most: float = 1.0, recurs: float = RECURS
+) -> float:
+    """Return log-odds after a frame, by `hits` in the `frames` before it: p_D is at `most` so much,
+    and p_A `recurs`."""
+    found = most * (hits + 1) / (frames + 2)
+    said = log(found / recurs) if hit else log((1 - found) / (1 - recurs))
     return min(odds + said, SURE)

@@ -3,7 +3,7 @@ update and initiation."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -243,21 +243,32 @@ def update(
     """Condition states (..., S) on a measurement (..., 4) each, with covariances R (..., 4, 4).
     Components that are NaN were not measured; they are the same in all.
 
-    Iterated EKF in Joseph's form: linearisation at the new mean until it converges (Gauss-Newton on
+    Iterated EKF (`conditioned`): linearisation at the new mean until it converges (Gauss-Newton on
     the posterior), because a range known to a millimetre over a cross-range known to a metre is
-    visibly nonlinear. A converged state does not change any more. Of ambiguous velocities the
-    nearest to the state's counts.
+    visibly nonlinear. Of ambiguous velocities the nearest to the state's counts.
     """
     rows = np.flatnonzero(np.isfinite(measurement).reshape(-1, 4).all(axis=0))
-    R = R[..., rows[:, None], rows]
+
+    def seen(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        off = wrapped(measurement - measure(x, own, transmitter), ambiguity)
+        return off[..., rows], jacobian(x, own, transmitter)[..., rows, :]
+
+    return conditioned(g, R[..., rows[:, None], rows], seen)
+
+
+def conditioned(
+    g: Gaussian, R: np.ndarray, seen: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+) -> Gaussian:
+    """Condition states (..., S) on measurements (..., n) of covariances R by the iterated EKF in
+    Joseph's form. `seen` returns, at states, the measurements less the expected ones and the
+    derivatives H (..., n, S) of the latter. A converged state does not change any more."""
     mean, P = g
     x, moving = mean, np.ones(mean.shape[:-1], bool)
     enough = 1e-3 * np.sqrt(np.diagonal(P, axis1=-2, axis2=-1)) + ROUNDING
-    K, H = np.zeros((*mean.shape, rows.size)), np.zeros((*R.shape[:-1], mean.shape[-1]))
+    K, H = np.zeros((*mean.shape, R.shape[-1])), np.zeros((*R.shape[:-1], mean.shape[-1]))
     for _ in range(_ITERATIONS):
         # K = P H^T S^-1, S = H P H^T + R; x = mean + K (z - h(x) - H (mean - x))
-        off = wrapped(measurement - measure(x, own, transmitter), ambiguity)[..., rows]
-        at_x = jacobian(x, own, transmitter)[..., rows, :]
+        off, at_x = seen(x)
         H = np.where(moving[..., None, None], at_x, H)
         gain = np.linalg.solve(H @ P @ np.swapaxes(H, -1, -2) + R, H @ P)  # S^-1 H P
         K = np.swapaxes(gain, -1, -2)

@@ -88,7 +88,7 @@ class StaticClutter(TrackRule):
         return replace(detections, starts=detections.starts & ~self._crowd)
 
     def prune(self, tracker: Tracker, own: Ownship) -> None:
-        """End the tracks that are static within a crowd, and those, not confirmed before, that
+        """End the tracks that are static within a crowd, and those, not reported before, that
         an echo of one carries on: from beyond the view and along a wall they seem
         to move. Few hits confirm no track beside a surface: chance carries it from spot to spot."""
         for track in tracker.tracks:

@@ -8,7 +8,7 @@ motion, and what no terminal sees stays in its covariance.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import dropwhile
@@ -21,8 +21,8 @@ from isac_rt.plain import Stateful
 from isac_rt.track.filter import (
     INITIAL_POSITION_STD_LIMIT,
     INITIAL_SPEED_STD,
-    ROUNDING,
     Gaussian,
+    conditioned,
     curvature,
     jacobian,
     mahalanobis,
@@ -51,8 +51,6 @@ _DATUM = np.diag(np.repeat(np.square(DATUM_STD), 3))
 ATTITUDE_STD = np.radians(0.3)
 """Deviation of a terminal's attitude about each axis [rad]. Small inertial sensors with two
 antennas hold it."""
-ITERATIONS = 10
-"""Most linearisations of one detection."""
 HOLD_S = 0.5
 """How long a detection can be taken up in its order, and what was said counts without being said
 again [s]."""
@@ -355,12 +353,12 @@ class FusedTracks(Stateful):
         left = narrowed(uav, R, d.own, d.sender) if rows.size == 4 else uav
         new = np.array([b is None for b, _ in pairs])
         if new.any():  # a place that all of it fixes
-            of_all = _conditioned(g, R[ix], seen).covariance[new, :STATES, :STATES]
+            of_all = conditioned(g, R[ix], seen).covariance[new, :STATES, :STATES]
             left.covariance[new] = of_all
         R = (R + curvature(left, d.own, d.sender))[ix]
         y, H = seen(g.mean)
         tests, _ = mahalanobis(y, H @ g.covariance @ np.swapaxes(H, 1, 2) + R)
-        return _conditioned(g, R, seen), tests
+        return conditioned(g, R, seen), tests
 
     def _levers(self, uav: np.ndarray, d: Detection) -> np.ndarray:
         """Return the derivatives (K, 4, E) of what is measured of UAVs (K, 9) in the frame of a
@@ -381,26 +379,6 @@ class FusedTracks(Stateful):
         out[:, 2:, mine + SIZE : mine + POSE_ERRORS] = turned
         out[:, 0, self._bias[d.key.origin]] = 1.0
         return out[..., STATES:]
-
-
-def _conditioned(
-    g: Gaussian, R: np.ndarray, seen: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-) -> Gaussian:
-    """Condition states (K, S) on measurements (K, n) of covariances R as
-    `isac_rt.track.filter.update` does. `seen` returns, at states, the measurements less the
-    expected ones and the derivatives H (K, n, S) of the latter."""
-    (mean, P), x = g, g.mean
-    for _ in range(ITERATIONS):
-        off, H = seen(x)
-        S = H @ P @ np.swapaxes(H, 1, 2) + R
-        K = np.swapaxes(np.linalg.solve(S, H @ P), 1, 2)  # P H^T S^-1
-        before = x
-        x = mean + (K @ (off[..., None] - H @ (mean - x)[..., None]))[..., 0]
-        if (np.abs(x - before) <= 1e-3 * np.sqrt(np.diagonal(P, 0, 1, 2)) + ROUNDING).all():
-            break
-    A = np.eye(x.shape[1]) - K @ H  # Joseph
-    P = A @ P @ np.swapaxes(A, 1, 2) + K @ R @ np.swapaxes(K, 1, 2)
-    return Gaussian(x, (P + np.swapaxes(P, 1, 2)) / 2)
 
 
 def _starts(d: Detection) -> bool:

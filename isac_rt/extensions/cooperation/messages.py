@@ -4,7 +4,7 @@ carry them.
 An active terminal's messages ride on its data frames, a passive one's go back by its feedback. A
 message is made of what its sender knows after a frame and leaves with the next; it takes as many
 frames as its bits need and is lost with any of them, until the frame is read late. Nobody waits for
-an answer, and nothing is said twice unless it has changed.
+an answer; where there is room, earlier detections are said again.
 """
 
 from __future__ import annotations

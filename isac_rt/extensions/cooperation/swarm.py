@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import log
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +29,7 @@ from isac_rt.results.scoring import LinkResult
 from isac_rt.results.swarm import SWARM, Traffic, View
 from isac_rt.simulation.setup import Setup
 from isac_rt.simulation.stations import PREFETCHED_FRAMES
-from isac_rt.track.existence import SURE
+from isac_rt.track import existence
 from isac_rt.track.filter import Ambiguity, Gaussian, costs, expected, predict, wrapped
 from isac_rt.track.fused import Fused, Key, Name
 from isac_rt.track.parts import ReportedUav, of_itself
@@ -60,9 +59,9 @@ class Record(NamedTuple):
         """Return the record after a frame with a probability of detection by noise alone. What
         clutter leaves of it is between 0 and 1 alike, so that its mean is (hits + 1) / (frames + 2)
         (Laplace's rule of succession)."""
-        found = probability * (self.hits + 1) / (self.frames + 2)
-        said = max(log(found / CHANCE), 0.0) if hit else log((1 - found) / (1 - CHANCE))
-        return Record(min(self.odds + said, SURE), self.hits + hit, self.frames + 1)
+        odds = existence.updated(self.odds, hit, self.hits, self.frames, probability, CHANCE)
+        odds = max(odds, self.odds) if hit else odds
+        return Record(odds, self.hits + hit, self.frames + 1)
 
 
 @dataclass

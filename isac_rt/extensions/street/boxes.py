@@ -85,7 +85,7 @@ class Boxes:
         self, paths: PathSet, poses: dict[str, Pose], boxes: list[Box] | None = None
     ) -> Shadows:
         """Return the shadows on a link's paths at their epoch, of the boxes at that time."""
-        boxes = boxes or self._boxes(poses, paths.epoch)
+        boxes = self._boxes(poses, paths.epoch) if boxes is None else boxes
         (tx, rx), names = paths.link, paths.target_names
         state = LinkState(paths.link, paths.epoch, poses[tx], poses[rx], names)
         return Shadows(boxes, state, poses, self._free.wavelength, self._half_frame)
