@@ -64,16 +64,18 @@ class Job:
         section = s.reference.sections["person"].square_metres(*2 * [np.array([0.0, 1.0, 0.0])])
         sent, echo = frame.sent["radar"], frame.paths[LINK]
         gain = sent.amplitude * echo.gain[0] / np.sqrt(section)
-        flight = s.swarm.trajectories["person"]
+        flight, start = s.swarm.trajectories["person"], pose.position
+        far = np.linalg.norm(frame.poses["person"].position - start)
+        pattern = antennas.element_gain(pose.to_body(echo.departure))
         out = np.zeros((1, len(rx), len(chirps), w.num_samples), complex)
         for c, p in enumerate(chirps):
             time = p * w.slot_duration + w.fast_time
-            middle = flight.pose(time.mean()).position
             place = flight.positions(time)
             axes = body_axes(s.swarm, "person", float(time.mean()))
             points = place[:, None] + self.walker.motion(time).place @ axes.T
-            near = np.linalg.norm(middle - pose.position)
-            share = (near / np.linalg.norm(points - pose.position, axis=2)) ** 2
+            near = np.linalg.norm(points - start, axis=2)
+            ahead = pose.to_body((points - start) / near[..., None])
+            share = (far / near) ** 2 * antennas.element_gain(ahead) / pattern
             there = np.linalg.norm(points - tx[sent.schedule[0, p]], axis=2)
             for r, element in enumerate(rx):
                 back = np.linalg.norm(points - element, axis=2)

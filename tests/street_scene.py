@@ -60,7 +60,7 @@ def sum_over_points(
     ----------
     places : (N, K, 3) of the points at times (N,) [s] of the run
     amplitudes : (N, K) of the echo without spreading, at times and places, times the product of
-        the distances from the radar
+        the distances from the radar; with the elements' gain towards the target's place
     images : mirrors of the radar's position, over each of which a path comes and goes
     loss : amplitude of a reflection at the others than the first
     """
@@ -68,18 +68,32 @@ def sum_over_points(
     tx, rx = (
         pose.position + pose.to_world(r) for r in (antennas.tx_positions, antennas.rx_positions)
     )
-    sent = frame.sent["radar"]
+    sent, target = frame.sent["radar"], frame.poses["T"].position
     out = np.zeros((1, len(rx), w.num_chirps, w.num_samples), complex)
+
+    def seen(points: np.ndarray, mirror: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Distances over a mirror, and the elements' gain over that towards the target."""
+        each, one = points - pose.position * mirror, target - pose.position * mirror
+        length, ahead = np.linalg.norm(each, axis=2), one / np.linalg.norm(one)
+        towards = [pose.to_body(v * mirror) for v in (each / length[..., None], ahead)]
+        gain = [antennas.element_gain(v) for v in towards]
+        return length, gain[0] / gain[1]
+
     for p in range(w.num_chirps):
         time = setup.timetable.start_time(frame.number) + p * w.slot_duration + w.fast_time
         points = places(time)
         level = amplitudes(time, points)
         for a, there in enumerate(images):
             sends = np.linalg.norm(points - tx[sent.schedule[0, p]] * there, axis=2)
-            from_radar = np.linalg.norm(points - pose.position * there, axis=2)
+            from_radar, pattern = seen(points, there)
             for b, back in enumerate(images):
-                spread = from_radar * np.linalg.norm(points - pose.position * back, axis=2)
-                gain = level / spread * loss ** ((a > 0) + (b > 0))
+                to_radar, other = seen(points, back)
+                gain = (
+                    level
+                    / (from_radar * to_radar)
+                    * np.sqrt(pattern * other)
+                    * loss ** ((a > 0) + (b > 0))
+                )
                 for r, element in enumerate(rx):
                     tau = sends + np.linalg.norm(points - element * back, axis=2)
                     phase = w.phase(tau / SPEED_OF_LIGHT, w.fast_time[:, None])

@@ -8,9 +8,10 @@ the ends of a link as the UAV sees them, over all walls of the path, U the UAV a
 
 which is exact for mirrors. It is cut into pieces of whole slots, each a polynomial of the second
 order about its middle, as long as `PHASE_ERROR` allows (`remainder`), a slot at least. Directions
-and radii at both ends follow the centre from piece to piece; so does spherical spreading. The
-elements' pattern, reflection and occlusion are those of the UAV's path. Copies are made after the
-plan's choice of paths and before synthesis: what scores and draws paths sees the UAV's own.
+and radii at both ends follow the centre from piece to piece; so do spherical spreading, the
+centre's aspect and the elements' pattern. Reflection and occlusion are those of the UAV's path.
+Copies are made after the plan's choice of paths and before synthesis: what scores and draws paths
+sees the UAV's own.
 """
 
 from __future__ import annotations
@@ -40,6 +41,11 @@ LEAST_THRUST = 0.1
 """Acceleration of thrust [m/s^2] below which the body's Z axis is left upright: it falls freely."""
 PROBES = 4
 """Instants of a frame at which a path is asked whether blades matter to it."""
+Poses = Mapping[str, Pose]
+Of = tuple[str, CentreModel, "Attitude"]
+"""A UAV's name, a model of its centres, and its attitude."""
+Pieces = tuple[Motion, np.ndarray, np.ndarray]
+"""Motion about the UAV in pieces of a frame, their begin (T + 1,) and middles (T,) [s]."""
 
 
 def moving_centres(
@@ -88,7 +94,7 @@ class MovingCentres:
     def with_centres(
         self,
         paths: PathSet,
-        poses: Mapping[str, Pose],
+        poses: Poses,
         middle: float,
         least_power: float = 0.0,
         shadow: Callable[[PathSet, np.ndarray], np.ndarray] | None = None,
@@ -106,22 +112,22 @@ class MovingCentres:
         gives_way = [name for name, model in self.models if model.replaces_echo]
         kept, later = paths.select(~np.isin(target, gives_way)), middle - paths.epoch
         parts = [kept, *self._over_blades(kept, poses, later, least_power)]
+        half = self.waveform.frame_duration / 2
         for name, model in self.models:
-            of = name, model, self._attitude(name, paths.epoch)
+            of = name, model, attitude_about(self.swarm, name, paths.epoch, half)
             least = 0.0 if model.replaces_echo else least_power
             bases = [b for b in self._bases(paths, target == name, poses, of) if b.power > least]
             if bases:
                 slots = 1 if self._screens(paths.link) else self._slots_of_piece(paths, poses, of)
                 begin, time = pieces(self.waveform, slots, later)
-                offset = of[2].turned(model.motion(paths.epoch + time), time)
+                at = of[2].turned(model.motion(paths.epoch + time), time), begin, time
                 faded = np.ones((len(bases), time.size))
                 if shadow is not None:
                     each = paths.select(np.repeat([base.row for base in bases], time.size))
                     faded = shadow(each, np.tile(time, len(bases))).reshape(faded.shape)
                 faded = faded * [self.passed(base.path, time) for base in bases]
                 for base, fade in zip(bases, faded, strict=True):
-                    amplitudes = model.amplitudes(*base.towards, paths.epoch + time)
-                    parts.append(_copies(base, amplitudes * fade[:, None], offset, begin, time))
+                    parts.append(self._copies(base, of, poses, fade, at))
         own = self.own_echoes(paths, poses, later)
         if own is not None and (own.power.sum() > least_power * self.waveform.num_chirps):
             parts.append(own)
@@ -156,7 +162,7 @@ class MovingCentres:
         return np.prod([np.ones(time.size), *left], axis=0)
 
     def _over_blades(
-        self, paths: PathSet, poses: Mapping[str, Pose], later: float, least: float
+        self, paths: PathSet, poses: Poses, later: float, least: float
     ) -> Iterator[PathSet]:
         """Yield waves over squares of the terminals' own blades, slot by slot, that take from a
         link's paths what these hide, where that exceeds a power |gain|^2 together."""
@@ -173,21 +179,42 @@ class MovingCentres:
                 longer, rate, accel = (a + b for a, b in zip(*ways, strict=True))
                 longer -= np.linalg.norm(far)
                 towards = squares.place / ways[0][0][..., None]
-                gain, to_body = self.arrays.of(name).element_gain, poses[name].to_body
-                pattern = gain(to_body(towards)) / gain(to_body(getattr(path, way)))
+                pattern = self._pattern(name, poses, towards, getattr(path, way))
                 phase = np.exp(1j * screens[name].wave_number * longer)
-                columns = {"gain": -left * share * phase * np.sqrt(pattern), way: towards}
+                columns = {"gain": -left * share * phase * pattern, way: towards}
                 columns |= {"delay": longer, "delay_rate": rate, "delay_accel": accel}
                 yield _pieces(path, columns | {f"{end}_radius": ways[0][0]}, begin, time)
                 left = left * (1 - share.sum(axis=1, keepdims=True))
 
-    def _bases(
-        self,
-        paths: PathSet,
-        which: np.ndarray,
-        poses: Mapping[str, Pose],
-        of: tuple[str, CentreModel, Attitude],
-    ) -> list[Base]:
+    def _copies(self, base: Base, of: Of, poses: Poses, fade: np.ndarray, at: Pieces) -> PathSet:
+        """Return the copies of one path to the centres of a model, times `fade` (T,). Each has the
+        aspect and the antenna pattern of its own directions."""
+        path, (_, model, attitude), (offset, begin, time) = base.path, of, at
+        there = segment(base.sent, time, offset)
+        back = there if base.received is base.sent else segment(base.received, time, offset)
+        towards, seen = (leg.towards @ attitude.axes_at(time) for leg in (there, back))
+        gain = base.gain * model.amplitudes(towards, seen, path.epoch + time) * fade[:, None]
+        columns = {
+            "gain": gain * there.spreading * back.spreading,
+            "delay": there.longer + back.longer,
+            "delay_rate": there.rate + back.rate,
+            "delay_accel": there.accel + back.accel,
+        }
+        ends = ("tx", "departure", base.sent, there), ("rx", "arrival", base.received, back)
+        for end, way, image, leg in ends:
+            own, radius = getattr(path, way), getattr(path, f"{end}_radius")
+            columns[way] = _unit(own + (image.towards - leg.towards) @ image.mirror.T)
+            columns[f"{end}_radius"] = np.where(np.isinf(radius), np.inf, leg.length)
+            columns["gain"] *= self._pattern(getattr(path, end), poses, columns[way], own)
+        return _pieces(path, columns, begin, time)
+
+    def _pattern(self, name: str, poses: Poses, towards: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """Return the amplitude of a terminal's elements towards directions (..., 3), over that
+        towards a path's own."""
+        gain, to_body = self.arrays.of(name).element_gain, poses[name].to_body
+        return np.sqrt(gain(to_body(towards)) / gain(to_body(own)))
+
+    def _bases(self, paths: PathSet, which: np.ndarray, poses: Poses, of: Of) -> list[Base]:
         """Return the paths of a UAV that are copied to the centres of a model."""
         (name, model, attitude), out = of, []
         for row in np.flatnonzero(which):
@@ -199,10 +226,10 @@ class MovingCentres:
             towards = images[0].towards @ attitude.axes, images[1].towards @ attitude.axes
             gain = path.gain / np.sqrt(section)
             power = float(np.abs(gain[0]) ** 2 * model.square_metres(*towards))
-            out.append(Base(int(row), path, *images, towards, gain, power))
+            out.append(Base(int(row), path, *images, gain, power))
         return out
 
-    def own_echoes(self, paths: PathSet, poses: Mapping[str, Pose], later: float) -> PathSet | None:
+    def own_echoes(self, paths: PathSet, poses: Poses, later: float) -> PathSet | None:
         """Return the echoes of a radar's own blades, slot by slot, the middle of the frame `later`
         [s] than the epoch; None without."""
         if not paths.link.own or paths.tx not in self.own:
@@ -226,23 +253,15 @@ class MovingCentres:
         received = columns["gain"].any(axis=0)
         if not received.any():
             return None
-        at_arrays = make_paths(
-            tx=name,
-            rx=name,
-            epoch=paths.epoch,
-            target_names=paths.target_names,
-            kind=PathKind.LEAKAGE,
-            gain=[1.0],
-            delay=[0.0],
-            departure=towards[0, :1],
-            arrival=towards[0, :1],
-        )
+        at: dict[str, Any] = dict.fromkeys(("departure", "arrival"), towards[0, :1])
+        at |= {"gain": [1.0], "delay": [0.0], "kind": PathKind.LEAKAGE, "epoch": paths.epoch}
+        at_arrays = make_paths(tx=name, rx=name, target_names=paths.target_names, **at)
         return _pieces(at_arrays, columns, begin, time).select(np.tile(received, time.size))
 
     def report(
         self,
         found: Mapping[Link, PathSet],
-        poses: Mapping[str, Pose],
+        poses: Poses,
         over_noise: Mapping[Link, float],
     ) -> list[dict[str, Any]]:
         """Return what the plan says of each model: `Item`'s values by name.
@@ -257,7 +276,8 @@ class MovingCentres:
         for name, model in self.models:
             most, slots = 0.0, 1
             for link, paths in found.items():
-                of = name, model, self._attitude(name, paths.epoch)
+                attitude = attitude_about(self.swarm, name, paths.epoch, w.frame_duration / 2)
+                of = name, model, attitude
                 for base in self._bases(paths, _echoing(paths) == name, poses, of):
                     if (power := base.power * over_noise[link]) > most:
                         most, slots = power, self._slots_of_piece(paths, poses, of)
@@ -308,12 +328,7 @@ class MovingCentres:
         row = dict(zip(("what", "left_out", "estimate"), about, strict=True))
         return {**row, "modelled": f"{model.described()}, {seen}", "unit": "rad"}
 
-    def _slots_of_piece(
-        self,
-        paths: PathSet,
-        poses: Mapping[str, Pose],
-        of: tuple[str, CentreModel, Attitude],
-    ) -> int:
+    def _slots_of_piece(self, paths: PathSet, poses: Poses, of: Of) -> int:
         """Return the number of slots over which delays of the second order and constant directions
         keep within `PHASE_ERROR`.
 
@@ -337,10 +352,6 @@ class MovingCentres:
         by_turning = PHASE_ERROR / max(k * turning, np.finfo(float).tiny)
         by_delay = (3 * PHASE_ERROR / max(k * jerk, np.finfo(float).tiny)) ** (1 / 3)
         return int(np.clip(2 * min(by_turning, by_delay) / w.slot_duration, 1, w.num_chirps))
-
-    def _attitude(self, name: str, epoch: float) -> Attitude:
-        """Return a UAV's attitude about the epoch, to the second order in a frame."""
-        return attitude_about(self.swarm, name, epoch, self.waveform.frame_duration / 2)
 
 
 class Attitude(NamedTuple):
@@ -416,7 +427,6 @@ class Base(NamedTuple):
 
     Attributes
     ----------
-    towards : (3,) unit vectors to both ends in the axes of the body
     gain : (1,) of a centre of one square metre in place of the UAV
     power : |gain|^2 of all centres together
     """
@@ -425,7 +435,6 @@ class Base(NamedTuple):
     path: PathSet
     sent: EndImage
     received: EndImage
-    towards: tuple[np.ndarray, np.ndarray]
     gain: np.ndarray
     power: float
 
@@ -434,28 +443,6 @@ def _echoing(paths: PathSet) -> np.ndarray:
     """Return the UAV (K,) whose echo each path is, over walls at rest; empty without."""
     target = np.where((paths.faces < -1).any(axis=1), -1, paths.target)
     return np.array([*paths.target_names, ""])[target]
-
-
-def _copies(
-    base: Base, amplitudes: np.ndarray, offset: Motion, begin: np.ndarray, time: np.ndarray
-) -> PathSet:
-    """Return the copies of one path to centres of amplitudes (K,) or (T, K) [m] that move by
-    `offset` about the UAV, in pieces from `begin` (T + 1,) about `time` (T,) [s since the epoch].
-    """
-    path = base.path
-    there = segment(base.sent, time, offset)
-    back = there if base.received is base.sent else segment(base.received, time, offset)
-    columns = {
-        "gain": base.gain * amplitudes * there.spreading * back.spreading,
-        "delay": there.longer + back.longer,
-        "delay_rate": there.rate + back.rate,
-        "delay_accel": there.accel + back.accel,
-        "departure": _unit(path.departure + there.turn @ base.sent.mirror.T),
-        "arrival": _unit(path.arrival + back.turn @ base.received.mirror.T),
-        "tx_radius": np.where(np.isinf(path.tx_radius), np.inf, there.length),
-        "rx_radius": np.where(np.isinf(path.rx_radius), np.inf, back.length),
-    }
-    return _pieces(path, columns, begin, time)
 
 
 def _pieces(
@@ -481,7 +468,7 @@ def _pieces(
     return make_paths(tx=tx, rx=rx, epoch=path.epoch, target_names=names, **same, **flat)
 
 
-def end_images(path: PathSet, poses: Mapping[str, Pose], name: str) -> tuple[EndImage, EndImage]:
+def end_images(path: PathSet, poses: Poses, name: str) -> tuple[EndImage, EndImage]:
     """Return the transmitter and the receiver of one path as a UAV sees them; one object where
     they are the same."""
     uav, points = poses[name], path.points[0]
@@ -515,8 +502,8 @@ class Segment(NamedTuple):
     ----------
     length : (T, K) of the way [m]
     longer, rate, accel : (T, K) its excess over the way to the UAV and its derivatives
-    spreading : (T, K) length of the way to the UAV over that to the centre
-    turn : (T, K, 3) direction to the centre less that to the UAV at the epoch, at the UAV
+    spreading : (T, K) length of the way to the UAV at the epoch over that to the centre
+    towards : (T, K, 3) unit vectors from the centres to the end's image
     """
 
     length: np.ndarray
@@ -524,7 +511,7 @@ class Segment(NamedTuple):
     rate: np.ndarray
     accel: np.ndarray
     spreading: np.ndarray
-    turn: np.ndarray
+    towards: np.ndarray
 
 
 def segment(image: EndImage, time: np.ndarray, offset: Motion) -> Segment:
@@ -542,8 +529,11 @@ def segment(image: EndImage, time: np.ndarray, offset: Motion) -> Segment:
     rho, q = offset.place, uav.place
     longer = np.vecdot(rho, rho - 2 * q) / (of_centre[0] + of_uav[0])
     rate, accel = (a - b for a, b in zip(of_centre[1:], of_uav[1:], strict=True))
-    turn = image.towards - centre.place / of_centre[0][..., None]
-    return Segment(of_centre[0], longer, rate, accel, of_uav[0] / of_centre[0], turn)
+    spreading, towards = (
+        np.linalg.norm(place) / of_centre[0],
+        centre.place / of_centre[0][..., None],
+    )
+    return Segment(of_centre[0], longer, rate, accel, spreading, towards)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

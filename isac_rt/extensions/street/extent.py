@@ -89,13 +89,16 @@ class Fixed(CentreModel):
     def amplitudes(
         self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
     ) -> np.ndarray:
-        each = [section.square_metres(incident, observed) for section in self.sections]
-        out = np.sqrt(np.ravel(each)).astype(complex)
-        total = incident + observed
-        bisector = total / max(float(np.linalg.norm(total)), 1e-9)
-        for k, (cosine, sine) in self.phases.items():
-            phasor = in_table(cosine, bisector) + 1j * in_table(sine, bisector)
-            out[k] *= np.exp(1j * np.angle(phasor).item())
+        ends = [np.broadcast_to(u, (time.size, *self.places.shape)) for u in (incident, observed)]
+        out = np.zeros(ends[0].shape[:2], complex)
+        for k, section in enumerate(self.sections):
+            one, other = (end[:, k] for end in ends)
+            out[:, k] = np.sqrt(section.square_metres(one, other))
+            if k in self.phases:
+                size = np.linalg.norm(one + other, axis=1, keepdims=True)
+                half = (one + other) / np.maximum(size, 1e-9)
+                cosine, sine = (in_table(table, half) for table in self.phases[k])
+                out[:, k] *= np.exp(1j * np.arctan2(sine, cosine))
         return out
 
     def square_metres(self, incident: np.ndarray, observed: np.ndarray) -> Any:

@@ -62,8 +62,8 @@ class CentreModel(ABC):
     def amplitudes(
         self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
     ) -> np.ndarray:
-        """(K,) square root of each centre's cross-section [m] towards source and observer, unit
-        vectors (3,) in the body's axes; (T, K) where it changes with time (T,) [s]."""
+        """(K,) square root of each centre's cross-section [m], or (T, K), towards source and
+        observer, unit vectors (3,) or (T, K, 3) in the body's axes, at times (T,) [s]."""
         return self.amplitude
 
     def square_metres(self, incident: np.ndarray, observed: np.ndarray) -> Any:

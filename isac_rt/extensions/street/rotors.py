@@ -8,8 +8,8 @@ one point each quarter of a wavelength leaves 1e-5.
 
 The obliquity of a plate with the normal n is the mean of :math:`|n\cdot u_1|` of a field across the
 plane of incidence and of :math:`|n\cdot u_2|` of one in it; from one place both are the same. The
-chord has a few points with exact delays. Near the direction in the middle of a piece their
-amplitudes give the integral over the chord: its phase is interpolated between them.
+chord has a few points with exact delays. Near the direction in the middle of a piece, seen from the
+chord's middle, their amplitudes give the integral over the chord: its phase is interpolated.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from scipy.interpolate import BarycentricInterpolator
+from scipy.interpolate import BarycentricInterpolator, CubicSpline
 from scipy.special import spherical_jn
 
 from isac_rt.extensions.street.motion import PHASE_ERROR, CentreModel, Motion
@@ -32,6 +32,8 @@ CHORD_LEFT_OUT = 1e-3
 """Amplitude that the points of a chord may miss, a tenth of what pieces miss of the obliquity."""
 ANGLES = 8
 """Angles of a blade in each lobe of its pattern at which mean powers are summed."""
+Y_STEPS = 16
+"""Samples of a chord's pattern in a radian of y, between which it is cubic to 1e-6."""
 PLASTIC = ((np.sqrt(3.0) - 1) / (np.sqrt(3.0) + 1)) ** 2
 """Power that a plastic surface with a permittivity of 3 reflects."""
 
@@ -113,15 +115,18 @@ class Plates(Blades):
     def amplitudes(
         self, incident: np.ndarray, observed: np.ndarray, time: np.ndarray
     ) -> np.ndarray:
-        angle = self.start + self.spin * time[:, None]
-        obliquity, _, y = self._aspect(angle, incident, observed)
-        place, weight = np.polynomial.legendre.leggauss(num_points(float(np.abs(y).max())))
+        shape = time.size, self.start.size, self.nodes.size, -1, 3
+        ends = (np.broadcast_to(u, (time.size, *self.hub.shape)) for u in (incident, observed))
+        middle = (u.reshape(shape)[:, :, self.nodes.size // 2] for u in ends)
+        obliquity, _, y = self._aspect(self.start + self.spin * time[:, None], *middle)
+        most = float(np.abs(y).max()) + 1
+        place, weight = np.polynomial.legendre.leggauss(num_points(most))
         # Lagrange's polynomials of the nodes at the places
         share = weight / 2 * BarycentricInterpolator(self.nodes, np.eye(self.nodes.size))(place).T
-        chord = np.exp(1j * y[..., None] * place) @ share.T
-        chord *= obliquity[..., None] * np.exp(-1j * y[..., None] * self.nodes)
-        along = self.radius.size // (self.start.size * self.nodes.size)
-        return np.asarray(self.amplitude * chord.reshape(time.size, -1).repeat(along, axis=1))
+        at = np.linspace(-most, most, int(2 * most * Y_STEPS) + 2)[:, None]
+        chord = np.exp(1j * at * place) @ share.T * np.exp(-1j * at * self.nodes)
+        chord = CubicSpline(at[:, 0], chord)(y) * obliquity[..., None]
+        return np.asarray(self.amplitude * np.moveaxis(chord, 3, 2).reshape(time.size, -1))
 
     def square_metres(self, incident: np.ndarray, observed: np.ndarray) -> float:
         lobes = int(4 * self.wave_number * self.rotors.blade_length_m / np.pi) + 1
@@ -133,10 +138,12 @@ class Plates(Blades):
     def _aspect(
         self, angle: np.ndarray, incident: np.ndarray, observed: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return obliquity, x and y of blades at angles (..., N)."""
-        (blade, chord, normal), r, both = self.axes(angle), self.rotors, incident + observed
-        obliquity = (np.abs(normal @ incident) + np.abs(normal @ observed)) / 2
-        x, y = blade @ both * r.blade_length_m, chord @ both * (r.chord_m or 0.0)
+        """Return obliquity, x and y (..., N, A) of blades at angles (..., N), towards ends
+        (..., N, A, 3), or (3,) and A = 1."""
+        blade, chord, normal = (v[..., None, :] for v in self.axes(angle))
+        obliquity = sum(np.abs(np.vecdot(normal, end)) for end in (incident, observed)) / 2
+        x, y = (np.vecdot(v, incident + observed) for v in (blade, chord))
+        x, y = x * self.rotors.blade_length_m, y * (self.rotors.chord_m or 0.0)
         return obliquity, self.wave_number / 2 * x, self.wave_number / 2 * y
 
     def axes(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
