@@ -108,8 +108,9 @@ PLACES = {
         "munich_swarm.yaml",
         78,
         changes=(
-            "belief={velocity_std_mps: 0.06, level_db: 3, mesh_m: 0.1, position_std_m: 0.06, "
-            "attitude_std_deg: 0.3}",
+            "belief={velocity_std_mps: 0.06, level_db: 3, mesh_m: 0.2, position_std_m: 0.06, "
+            "attitude_std_deg: 0.3, materials: {marble: {scattering_coefficient: 0.4}, "
+            "concrete: {scattering_coefficient: 0.15}}}",
         ),
         compared=(),
     ),
@@ -120,7 +121,8 @@ PLACES = {
         compared=(),
     ),
 }
-"""By name. Wrong beliefs: 0.1 m/s, 3 dB, 0.1 m of place and of each plane, 0.5 degrees (rms)."""
+"""By name. Wrong beliefs: 0.1 m/s, 3 dB, 0.1 m of place, 0.2 m of each plane, 0.5 degrees (rms),
+and walls of twice and of half the amplitude that they scatter."""
 
 
 @dataclass(frozen=True)

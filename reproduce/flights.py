@@ -86,7 +86,7 @@ def _at(role: str, value: Callable[[Block], float]) -> Callable[[Block], Values]
     }
 
 
-def _misread(outcome: Block) -> Values:
+def misread(outcome: Block) -> Values:
     """Count the frames that were read and have most of their delay or DPSK symbols wrong."""
     out = {}
     for link, rows in outcome["by_frame"].items():
@@ -182,7 +182,7 @@ GOALS = {
     ),
     "pt_gospa": Goal(f"PT: {_OF_EMPTY}", _at(_PT, _of_empty), 1.0),
     "fused_gospa": Goal(f"fused: {_OF_EMPTY}", _fused(_of_empty), 0.6, 0.3),
-    "misread": Goal("data frames of SER over 0.5 that count as read", _misread, 0, 0, pool=np.sum),
+    "misread": Goal("data frames of SER over 0.5 that count as read", misread, 0, 0, pool=np.sum),
     "switches": Goal("switched names of UAVs in the fused tracks", _fused(_switches), limit=0.5),
     "seconds": Goal("processor seconds a frame for reception and tracking", _seconds),
 }

@@ -32,7 +32,19 @@ KINDS = "look", "report"
 FORMATIONS = ("facing", "beside", "square", "crossing", "abreast", "hovering")
 PT_TURN_DEG = {"facing": (160, 200), "beside": (10, 40), "square": (75, 105)}
 """Angle about the targets from the active to the first passive terminal; else any."""
-ARRAYS: tuple[dict[str, int], ...] = ({}, {"rx_x": 4, "rx_z": 4}, {"rx_x": 12, "rx_z": 6})
+ARRAYS: tuple[dict[str, Any], ...] = (
+    {},
+    {
+        "tx": {"positions": [[0, 0], [2, 0], [0, 2]]},
+        "rx": {"shape": "planar", "columns": 4, "rows": 4},
+    },
+    {
+        "tx": {"positions": [[0, 0], [1, 0.5], [2, 0]]},
+        "rx": {"shape": "linear", "columns": 4},
+    },
+)
+"""The L, a plane of 8 by 8 virtual elements less a corner, and a row with little elevation as on
+boards of three transmit and four receive antennas."""
 MOST_SPEED_MPS, HEIGHT_M, DISTANCE_M, SPACING_M = 25.0, (4.0, 30.0), (12.0, 25.0), 3.0
 """Highest speed over ground; heights over it; from the active terminal to the middle of the
 targets; between targets in a row."""

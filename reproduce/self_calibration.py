@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from isac_rt.extensions.city_receivers.self_calibration import KnownDirection, SelfCalibration
+from isac_rt.extensions.hardware.self_calibration import KnownDirection, SelfCalibration
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.randomness import generator

@@ -74,17 +74,18 @@ def test_data_in_the_shadow_by_hand():
     """Frames 3, 4 lost, 5 read with one wrong symbol, 12 a pilot, 36 read, 40 misread, in one seed;
     in the other all are read. Planted bugs: frames after the shadow among those read in it; pilots
     that count."""
-    whole = [[f, 0, 0, 100, 0, 50] for f in (3, 4, 5, 36, 40)]
+    whole = [[f, 0, 0, 100, 0, 50, 1] for f in (3, 4, 5, 36, 40)]
     torn = [
-        [3, 0, 100, 100, 50, 50],
-        [4, 0, 100, 100, 50, 50],
-        [5, 0, 1, 100, 2, 50],
-        [12, 1, 0, 0, 0, 0],
-        [36, 1, 0, 100, 0, 50],
-        [40, 1, 60, 100, 9, 50],
+        [3, 0, 100, 100, 50, 50, 0],
+        [4, 0, 100, 100, 50, 50, 0],
+        [5, 0, 1, 100, 2, 50, 1],
+        [12, 1, 0, 0, 0, 0, 1],
+        [36, 1, 0, 100, 0, 50, 1],
+        [40, 1, 60, 100, 9, 50, 1],
     ]
     outcomes = [{"by_frame": {"AT->PT1": rows}} for rows in (torn, whole)]
-    read, delay, phase, late = (g.found.value for g in city._goals_of_data(outcomes))
+    every, read, delay, phase, late = (g.found.value for g in city._goals_of_data(outcomes))
+    assert every == pytest.approx((2 + 5) / 2)
     assert read == pytest.approx((1 + 3) / 2)
     assert delay == pytest.approx(1 / 400)
     assert phase == pytest.approx(2 / 200)

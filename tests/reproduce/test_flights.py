@@ -76,7 +76,7 @@ def test_misread_frames_by_hand():
     rows = [[3, 1, 60, 100, 0, 50, 1], [4, 1, 0, 100, 26, 50, 1], [5, 1, 100, 100, 50, 50, 0]]
     rows += [[12, 1, 0, 0, 0, 0, 1], [13, 1, 50, 100, 25, 50, 1]]
     outcome = {"by_frame": {"AT->PT1": rows, "AT->AT": []}}
-    assert flights._misread(outcome) == {"AT->PT1": 2, "AT->AT": 0}
+    assert flights.misread(outcome) == {"AT->PT1": 2, "AT->AT": 0}
 
 
 def test_a_folder_of_scenes_is_flown_once(tmp_path, monkeypatch, capsys):

@@ -7,9 +7,9 @@ from functools import partial
 
 from isac_rt.extensions.city_receivers.ghosts import Ghosts, Leeway
 from isac_rt.extensions.city_receivers.images import Images
-from isac_rt.extensions.city_receivers.known_paths import LearnedHardware
 from isac_rt.extensions.city_receivers.out_of_sequence import OutOfSequence
 from isac_rt.extensions.city_receivers.static_clutter import StaticClutter
+from isac_rt.extensions.hardware.known_paths import LearnedHardware
 from isac_rt.frame.link import Link
 from isac_rt.receive.passive import PassiveReceiver
 from isac_rt.scenario.presets import ReceiverSet

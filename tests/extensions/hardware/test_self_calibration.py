@@ -9,8 +9,8 @@ import pytest
 from crb_model import bound, samples
 from receiver_cubes import ANTENNAS, Path, cube
 
-from isac_rt.extensions.city_receivers.known_paths import LearnedHardware, seen_after
-from isac_rt.extensions.city_receivers.self_calibration import (
+from isac_rt.extensions.hardware.known_paths import LearnedHardware, seen_after
+from isac_rt.extensions.hardware.self_calibration import (
     FREE,
     Change,
     KnownDirection,

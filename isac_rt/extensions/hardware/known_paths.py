@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from isac_rt.extensions.city_receivers.self_calibration import (
+from isac_rt.extensions.hardware.self_calibration import (
     FREE,
     Change,
     KnownDirection,
