@@ -9,7 +9,7 @@ import os
 
 import pytest
 
-from benchmarks import REQUIRED, datasets, endtoend, hermes, nufft, reception, synthesis
+from benchmarks import REQUIRED, datasets, endtoend, hermes, moving, nufft, reception, synthesis
 from isac_rt.cli.cli import main
 from isac_rt.kernels.signal_gridded import GRIDDED_ERROR
 
@@ -57,6 +57,16 @@ def test_rows_of_data_sets():
         said = str(rows[f"{end}: all with the IF samples"]["also"])
         size = float(said.split(", ")[-1].split()[0].replace(",", ""))
         assert 3 * 15 * 120 * 1024 * 8 / 1e3 < size < 3 * 15 * 120 * 1024 * 8 / 1e3 + 700
+
+
+def test_rows_of_a_pedestrian():
+    """At 0.05 % beside the exact model, which costs a hundred times as much. Planted bugs: a
+    `PHASE_ERROR` of 0.1; the exact model's cost of some chirps for that of all."""
+    ours, exact = moving.rows(quick=True)
+    assert all(set(REQUIRED) <= set(row) for row in (ours, exact))
+    assert (ours["size"], exact["error"], exact["oracle"]) == (128, 0.0, True)
+    assert 0 < ours["error"] < 5e-4 and not ours["oracle"]
+    assert exact["cost"] > 50 * ours["cost"]
 
 
 def test_hermespy_is_left_out_where_it_is_not_installed(tmp_path, monkeypatch, capsys):
