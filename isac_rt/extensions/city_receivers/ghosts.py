@@ -175,7 +175,8 @@ def suspicion(
     walls : the mesh
     leeway : what detections leave open
     reported : likewise, UAVs that other terminals report, with the same reference. Those not
-        known to a resolution would explain anything, and are left out
+        known to a resolution would explain anything, and are left out, as are those that an
+        active terminal tracks itself
     asked : (K,) bool, the tracks that may lie behind a wall; None: all but the reference
     single : (K,) bool, those whose detection is `alone`; None: none
     """
@@ -199,8 +200,13 @@ def suspicion(
         )
     sources = [(tracks, int(s)) for s in np.flatnonzero(tracks.confirmed & (out.behind < 0))]
     if reported is not None:
-        sure = (reported.std < leeway.resolution).all(axis=1)
-        sources += [(reported, int(s)) for s in np.flatnonzero(sure & ~reported.is_reference)]
+        new = (reported.std < leeway.resolution).all(axis=1) & ~reported.is_reference
+        if sender is None:  # an own track tells how strong echoes may be; nothing masks it
+            seen = tracks.select(tracks.confirmed)
+            off = reported.measured[:, None] - seen.measured
+            std = np.hypot(reported.std[:, None], seen.std)
+            new &= ~leeway.explained(off, std).any(axis=1)
+        sources += [(reported, int(s)) for s in np.flatnonzero(new)]
     reach = 2 * float(np.max(tracks.range, initial=0.0)) + 1
     for known, s in sources:
         if sender is None:

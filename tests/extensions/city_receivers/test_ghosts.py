@@ -153,8 +153,9 @@ def test_ghosts_are_suspected_and_bodies_are_not():
 @pytest.mark.parametrize(("share", "mirrored"), [(0.95, True), (1.05, False)])
 def test_an_echo_over_a_wall_is_weaker_than_its_source(share, mirrored):
     """The image of a UAV at 50 over the noise, as bright as two waves over one segment that is
-    longer by twice its range less the direct one: no more. Planted bugs: the power not asked; one
-    wave; the fourth power of the direct segment."""
+    longer by twice its range less the direct one: no more, though another terminal reports the UAV,
+    whose power it does not tell. Planted bugs: the power not asked; one wave; the fourth power of
+    the direct segment; reports of UAVs that are tracked."""
     body, own = BODY[:3], OWN.position - ORIGIN
     image = body * [-1, 1, 1] + [2 * WALL_X, 0, 0]
     near, far = (float(np.linalg.norm(p - own)) for p in (body, image))
@@ -163,10 +164,12 @@ def test_an_echo_over_a_wall_is_weaker_than_its_source(share, mirrored):
     seen.snr = share * brightest
     tracks = track_set([track(3, body, BODY[3:]), seen], OWN)
     asked = np.zeros(2, bool)  # only of the image
-    found = suspicion(
-        tracks, OWN, Walls(wall()), Leeway(RESOLUTION, Ambiguity(PERIOD)), None, asked
-    )
-    assert (found.mirrored[1] >= 0) == mirrored
+    at = Gaussian(np.concatenate([body + ORIGIN, BODY[3:]]), np.eye(6) * 1e-4)
+    told = track_set([Track.of_state(at)], OWN)
+    for reported in (None, told):
+        leeway = Leeway(RESOLUTION, Ambiguity(PERIOD))
+        found = suspicion(tracks, OWN, Walls(wall()), leeway, reported, asked)
+        assert (found.mirrored[1] >= 0) == mirrored
 
 
 def test_bodies_that_others_know_of_explain_echoes():
