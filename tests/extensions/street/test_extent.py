@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
@@ -15,15 +17,18 @@ from street_scene import (
     scene,
     sum_over_points,
 )
+from truths.moving import echo_over
 
 import isac_rt as irt
-from isac_rt.extensions.street.centres import body_axes
+from isac_rt.extensions.street.centres import MovingCentres, body_axes
 from isac_rt.extensions.street.extent import KINDS, fixed_of, of_several
 from isac_rt.extensions.street.walker import walker_of_flight
+from isac_rt.frame.antennas import Antennas, Arrays
+from isac_rt.propagation.rcs import CrossSection
 from isac_rt.receive.types import Detections
 from isac_rt.track.tracker import spread
-from isac_rt.world.settings import Extent, Uav
-from isac_rt.world.swarm import Swarm
+from isac_rt.world.settings import Extent, Rcs, Uav
+from isac_rt.world.swarm import Pose, Swarm
 
 PEDESTRIAN, VEHICLE = ({"extent": {"kind": kind}} for kind in ("pedestrian", "vehicle"))
 # TR 38.901 v19 tables 7.9.2.1-5 and -7: g_max, sigma_max of each point
@@ -124,6 +129,31 @@ def test_a_car_near_the_radar_is_the_sum_over_its_faces(place):
     )
     truth = sum_over_points(setup, frame, places, amplitudes)
     assert error_of(samples_of(setup, frame), truth) < 5e-4
+
+
+def test_a_car_between_two_terminals_has_each_faces_own_directions():
+    """By the bistatic radar equation: aspect, both ways and the elements' gains at both ends.
+    Planted bugs: the transmitter's pattern at both ends; the way there in both spreadings."""
+    w, arrays = irt.Waveform(num_chirps=6), Arrays(Antennas(gain=8.0, pattern="cosine"))
+    place, ends = np.array([2.0, 4.0, 0.5]), np.array([[0.0, 0.0, 0.0], [6.0, 1.0, 0.8]])
+    looks = (0.2, 1.0, 0.0), (-1.0, 0.6, 0.0)
+    poses = {n: Pose.at_rest(*at) for n, *at in zip("AB", ends, looks, strict=True)}
+    swarm = Swarm({"U": Uav(role="target", position_m=tuple(place))})
+    axes, car = body_axes(swarm, "U", 0.0), fixed_of(Extent(kind="vehicle"), 1, "U")
+    square_metre = CrossSection(Rcs(model="constant", value_dbsm=0.0), "U", 1)
+
+    def amplitude(point, section):
+        length = np.linalg.norm(point - ends, axis=1)
+        towards = (point - ends) / length[:, None]
+        gain = [arrays.common.element_gain(poses["AB"[i]].to_body(towards[i])) for i in (0, 1)]
+        sigma = section.square_metres(*(-towards @ axes)) * np.prod(gain)
+        return w.wavelength * np.sqrt(sigma / (4 * np.pi) ** 3) / length.prod()
+
+    echo = replace(echo_over(place, ends), gain=np.array([amplitude(place, square_metre) + 0j]))
+    moving = MovingCentres(swarm, {"U": square_metre}, w, arrays, [("U", car)])
+    found = moving.with_centres(echo, poses | swarm.poses(0.0), 0.0).gain.reshape(-1, 5)
+    centres = zip(place + car.places @ axes.T, car.sections, strict=True)
+    assert found[0] == pytest.approx([amplitude(*one) for one in centres], rel=1e-9)
 
 
 def test_limbs_over_the_ground_are_the_sum_over_images_at_every_sample():
