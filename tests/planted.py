@@ -349,8 +349,8 @@ OF_CASES = {
     ),
     "flat blade of points": Bug(
         "extensions/street/rotors.py",
-        "np.exp(-1j * y[..., None] * self.nodes)",
-        "np.exp(-1.05j * y[..., None] * self.nodes)",
+        "np.exp(-1j * at * self.nodes)",
+        "np.exp(-1.05j * at * self.nodes)",
     ),
     "what opaque blades take": Bug(
         "extensions/street/screening.py",
@@ -859,6 +859,38 @@ OF_TESTS = (
             "simulation/preflight.py",
             "sent = float(sending.element_gain(tx.to_body(polyline / distance)))",
             "sent = sending.gain",
+        ),
+    ),
+    (
+        "test_extent::test_a_car_near_the_radar_is_the_sum_over_its_faces",
+        Bug(
+            "extensions/street/centres.py",
+            "amplitudes(towards, seen, path",
+            "amplitudes(base.sent.towards, base.received.towards, path",
+        ),
+    ),
+    (
+        "test_extent::test_a_car_between_two_terminals_has_each_faces_own_directions",
+        Bug(
+            "extensions/street/centres.py",
+            "self._pattern(getattr(path, end), poses",
+            "self._pattern(path.tx, poses",
+        ),
+    ),
+    (
+        "test_rotors::test_samples_of_flat_blades_are_the_integral_at_every_sample",
+        Bug(
+            "extensions/street/rotors.py",
+            "u.reshape(shape)[:, :, self.nodes.size // 2]",
+            "u.reshape(shape).mean(axis=(1, 2, 3))[:, None, None]",
+        ),
+    ),
+    (
+        "test_boxes::test_a_mirror_that_turns_away_lives_no_longer",
+        Bug(
+            "extensions/street/faces.py",
+            "np.minimum(np.min(heights, axis=0), beside.min(axis=2))",
+            "beside.min(axis=2)",
         ),
     ),
 )
