@@ -25,6 +25,7 @@ from isac_rt.receive.types import Detections, Hints, Prediction, Reception
 from isac_rt.track.filter import measure
 from isac_rt.track.parts import Late, OtherPaths, Ownship, delayed
 from isac_rt.track.reference import COAST_CELLS, Reference, end_symbols, slip_cells
+from isac_rt.track.tracker import in_plane
 
 BATCH = 8
 """Frames kept at most."""
@@ -126,7 +127,7 @@ class OutOfSequence(OtherPaths):
     def _is_well_inside(self, reception: Reception) -> bool:
         """Return whether the reference is not so near the edge of the view that it may have come
         from the opposite one: a track of it would fly elsewhere."""
-        d = reception.detections
+        d = in_plane(reception.detections)
         edge = WELL_INSIDE * self._receiver.antennas.view_limit
         return bool((np.abs(d.direction[d.is_reference]) < edge).all())
 
@@ -157,7 +158,8 @@ class OutOfSequence(OtherPaths):
             self.state.path = self.state.path.at(time)
             if self._follow(detections):
                 return
-        d = detections.select(np.isfinite(detections.direction).all(axis=1))
+        d = in_plane(detections)
+        d = d.select(np.isfinite(d.direction).all(axis=1))
         if len(d):
             i = int(d.snr.argmax())
             mean = np.array([d.range[i], d.velocity[i], 0.0])

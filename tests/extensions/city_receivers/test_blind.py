@@ -213,13 +213,16 @@ def test_what_holds_no_data_of_a_path_does_not_lock(kind):
         assert acquire(kept, ANTENNAS, ORDER) is None, trial
 
 
-def terminal(amplitude, groups=None):
+ROW = replace(ANTENNAS, rx_z=1)
+
+
+def terminal(amplitude, groups=None, antennas=ANTENNAS):
     """A passive terminal for which a path of 25 m has a `amplitude` of free space."""
     receivers = Receivers(link_acquisition="blind", symbol_decision="beams")
-    free = ANTENNAS.gain * W.wavelength / (4 * np.pi * 25)
+    free = antennas.gain * W.wavelength / (4 * np.pi * 25)
     sent = amplitude / free
-    blind = OutOfSequence(PassiveReceiver.of(ANTENNAS, receivers, ORDER, groups), W)
-    settings = W, ANTENNAS, receivers, Tracking(), ORDER, sent, groups
+    blind = OutOfSequence(PassiveReceiver.of(antennas, receivers, ORDER, groups), W)
+    settings = W, antennas, receivers, Tracking(), ORDER, sent, groups
     return PassiveTerminal(*settings, Equipment(other_paths=blind))
 
 
@@ -236,22 +239,24 @@ def play(receiver, cubes, first=0):
     return out
 
 
-def cubes_of(sent, schedule, amplitude, noise=1.0):
+def cubes_of(sent, schedule, amplitude, antennas=ANTENNAS):
     return [
-        cube(W, schedule, payload, [path_at(n, amplitude)], noise=noise, seed=50 + n)
+        cube(W, schedule, payload, [path_at(n, amplitude)], antennas, noise=1.0, seed=50 + n)
         for n, payload in enumerate(sent)
     ]
 
 
-def test_a_terminal_reads_in_retrospect_and_goes_on():
+@pytest.mark.parametrize("antennas", [ANTENNAS, ROW], ids=["L", "row"])
+def test_a_terminal_reads_in_retrospect_and_goes_on(antennas):
     """No pilot at all. What is read late and at once is what was sent; as strong as free space, the
     path is the line of sight once it is read, and sensing goes on from it; 20 dB weaker it carries
     data only. Stopped and resumed with a batch that waits, all is as in one go. Planted bugs: late
-    frames not handed out, the batch not restored, a mirror path taken for the line of sight."""
+    frames not handed out, the batch not restored, a mirror path taken for the line of sight, a
+    direction asked on the axis that a row of antennas does not observe."""
     schedule, sent = payloads(6)
-    cubes = cubes_of(sent, schedule, 0.5)
+    cubes = cubes_of(sent, schedule, 0.5, antennas)
     for weaker, sees in ((1.0, True), (0.1, False)):
-        whole, first, second = (terminal(0.5 / weaker) for _ in range(3))
+        whole, first, second = (terminal(0.5 / weaker, None, antennas) for _ in range(3))
         heard = play(whole, cubes)
         read = {n: (now, r) for (n, now), r in heard.items() if r.decoded}
         assert sorted(read) == list(range(6)) and any(now > n for n, (now, _) in read.items())
@@ -268,6 +273,25 @@ def test_a_terminal_reads_in_retrospect_and_goes_on():
         assert parts.keys() == heard.keys()
         for key, reception in heard.items():
             assert np.array_equal(parts[key].bits, reception.bits), key
+
+
+@pytest.mark.parametrize("antennas", [ANTENNAS, ROW], ids=["L", "row"])
+def test_a_pilot_without_a_reference_goes_on_over_a_path(antennas):
+    """Two mirror paths in each of two pilots: over the stronger one, and in the second pilot over
+    the same, though the other is 6 dB stronger there; the data that follow are read over it.
+    Planted bugs: the strongest each time; the weakest; directions asked on both axes."""
+    schedule, sent = payloads(1)
+    receiver = terminal(5.0, None, antennas)
+    for n, other in enumerate((0.25, 1.0, 0.0)):
+        payload = sent[0] if n == 2 else unmodulated(W)
+        paths = [path_at(n, 0.5), Path(31.3, 6.1, other, arrival=(-0.5, 0.1))]
+        made = cube(W, schedule, payload, paths, antennas, noise=1.0, seed=50 + n)
+        reception, _ = receiver.step(made, OWN, n * INTERVAL, n == 2)
+        path = receiver.equipment.other_paths.state.path
+        assert path.mean[0] == pytest.approx(path_at(n).length, abs=0.1 * W.range_cell(1))
+        assert path.direction[0] == pytest.approx(ARRIVAL[0], abs=0.02)
+        assert not reception.line_of_sight
+    assert reception.decoded and np.array_equal(reception.bits, sent[0].bits)
 
 
 def test_a_path_is_found_again_within_what_was_predicted_of_it():
