@@ -18,10 +18,9 @@ from the variances of the channels' places; summed over n looks 2 T has 2 n degr
 References
 ----------
 .. [1] F. C. Robey et al., "A CFAR adaptive matched filter detector", IEEE Trans. Aerosp. Electron.
-Syst. 28(1), 1992, doi:10.1109/7.135446
+   Syst. 28(1), 1992, doi:10.1109/7.135446
 .. [2] K. J. Worsley, "Local maxima and the expected Euler characteristic of excursion sets of
-chi-squared, F and t fields", Adv. Appl.
-   Probab. 26(1), 1994, doi:10.2307/1427576
+   chi-squared, F and t fields", Adv. Appl. Probab. 26(1), 1994, doi:10.2307/1427576
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ import numpy as np
 from scipy import ndimage, optimize, special
 
 from isac_rt.extensions.city_receivers.covariance import Bucketed
-from isac_rt.extensions.city_receivers.power import TAPER, Taper, expected_power
+from isac_rt.extensions.city_receivers.power import TAPER, expected_power
 from isac_rt.receive.cfar import CfarRule, strong_lobes
 from isac_rt.receive.directions import (
     PRUNED,
@@ -142,7 +141,6 @@ class DirectionTest:
         known: Known,
         power: np.ndarray,
         clutter: ExpectedClutter | None,
-        taper: Taper = TAPER,
     ) -> DirectionTest:
         """Return the test of a frame of such mean power (rows, P) of a channel."""
         own, antennas = known.passes == 2, known.antennas
@@ -154,9 +152,9 @@ class DirectionTest:
         if clutter is None:
             noise, expected = noise_level(power, None, known.channels), np.zeros_like(power)
             return cls(known, search, looks, noise, expected, (usual, sure), None)
-        expected = expected_power(clutter, known, len(power), taper)
+        expected = expected_power(clutter, known, len(power))
         noise = noise_level(power, expected, known.channels)
-        scatterers = Bucketed.of(clutter, known, search, noise, taper)
+        scatterers = Bucketed.of(clutter, known, search, noise, TAPER)
         return cls(known, search, looks, noise, expected, (usual, sure), scatterers)
 
     @property

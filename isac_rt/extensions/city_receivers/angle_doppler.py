@@ -1,9 +1,9 @@
 """The adaptive matched filter in every range-Doppler cell, over all directions.
 
 The channels' maps are whitened with the covariance that the mesh and the own velocity predict; the
-statistic over its threshold is searched for peaks, which are estimated off the grid in the beam
-towards them: that beam takes out most of the clutter that shares the range-Doppler cell from
-elsewhere. The estimates' beam is the plain one, so that clutter within a lobe still pulls them.
+statistic over its threshold is searched for peaks, which are estimated off the grid in the whitened
+beam towards them: it takes out most of the clutter that shares the range-Doppler cell from
+elsewhere.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from isac_rt.extensions.city_receivers.adaptive import DirectionTest, noise_level, unexplained
 from isac_rt.extensions.city_receivers.correction import fit
-from isac_rt.extensions.city_receivers.power import TAPER, Taper, expected_power
+from isac_rt.extensions.city_receivers.power import expected_power
 from isac_rt.extensions.city_receivers.waves import waves_of
 from isac_rt.frame.antennas import resolutions
 from isac_rt.receive.cfar import LOBE_MARGIN, first_row, leaked, strongest_peaks
@@ -41,12 +41,10 @@ class AngleDoppler:
     ----------
     settings : Receivers
     estimator : of the peaks
-    taper : how uncertain the expected clutter is
     """
 
     settings: Receivers
     estimator: Estimator = OFF_GRID
-    taper: Taper = TAPER
 
     def sense(self, spectra: np.ndarray, known: Known, hints: Hints = NO_HINTS) -> Sensed:
         """Detections in cleaned spectra of echoes. The own velocity and the clutter's level are
@@ -107,7 +105,7 @@ class AngleDoppler:
     ) -> tuple[np.ndarray, np.ndarray, DirectionTest]:
         """Return the statistic over its threshold (rows, P) and its directions (rows, P, 2),
         Doppler centred, of the `channel_maps` of a frame and their mean power; and the test."""
-        test = DirectionTest.of(self.settings, known, power, clutter, self.taper)
+        test = DirectionTest.of(self.settings, known, power, clutter)
         ratio, cosines = test.ratio(maps, np.arange(len(power)))
         ratio *= in_their_span(ratio, len(known.leaks))
         around = power / (test.noise + test.expected)

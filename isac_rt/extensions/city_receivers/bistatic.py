@@ -1,5 +1,5 @@
 r"""A passive terminal's search for weak echoes: strong paths out, then every direction of every
-cell, whitened where clutter is, and once more in what the waves found there leave.
+cell, whitened where clutter is, and again in what the waves found there leave.
 
 What each transmit antenna sends comes from a direction that the receiver does not know, so that
 the channels of a cell are matched receiver by receiver and added in power over the L_tx transmit

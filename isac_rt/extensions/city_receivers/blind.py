@@ -11,7 +11,7 @@ is largest. What whole number of cells is still missing the alphabet says: data 
 only one shift leaves no symbol outside. A pilot in the batch says so too, as all its symbols are 0.
 
 What is kept of a frame is small: the strongest cells of every chirp as each receive antenna sees
-them (`Peaks`, 0.2 MB where the samples are 44). Symbols are decided from these once the path is
+them (`Peaks`, 0.4 MB where the samples are 44). Symbols are decided from these once the path is
 known.
 """
 
