@@ -17,8 +17,10 @@ from isac_rt.extensions.city_receivers.angle_doppler import (
 )
 from isac_rt.extensions.city_receivers.covariance import Bucketed
 from isac_rt.extensions.city_receivers.power import Taper, expected_power
-from isac_rt.frame.antennas import Antennas
+from isac_rt.frame.antennas import Antennas, antennas_of, resolutions
+from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.schedule import conventional_schedule
+from isac_rt.frame.settings import Array
 from isac_rt.frame.waveform import SPEED_OF_LIGHT, Waveform
 from isac_rt.receive.active import receive_active
 from isac_rt.receive.arms import Channels, all_channels
@@ -27,6 +29,7 @@ from isac_rt.receive.directions import channel_search, search_plain, search_whit
 from isac_rt.receive.estimate import Estimate, near_beam
 from isac_rt.receive.known import Known
 from isac_rt.receive.maps import accumulate, channel_maps
+from isac_rt.receive.passive import receive_passive
 from isac_rt.receive.settings import Receivers
 from isac_rt.receive.spectrum import clean_spectrum
 from isac_rt.receive.types import Detections, ExpectedClutter, Hints
@@ -340,8 +343,8 @@ def test_receiver_finds_what_clutter_hides():
     target = Path(2 * 17.3, -2 * 9.3 * 0.74, 1.1, (-0.5, -0.3), (-0.5, -0.3))
     received = cube(w, schedule, payload, [*truth, target], antennas, 20.0, 1)
     count = {}
-    for detector, more in (("cfar", {}), ("angle_doppler", {})):
-        settings = Receivers(clutter_detector=detector, false_alarm_rate=1e-5, **more)
+    for detector in ("cfar", "angle_doppler"):
+        settings = Receivers(clutter_detector=detector, false_alarm_rate=1e-5)
         d = receive_active(received, payload, antennas, settings, clutter=guess).detections
         near = (np.abs(d.range - 17.3) < w.range_cell(2)) & (
             np.abs(d.velocity - target.rate / 2) < w.velocity_cell(2)
@@ -466,7 +469,7 @@ def test_uavs_in_one_cell_are_told_apart_by_their_directions(clutter):
 
 def test_a_strong_wave_is_one():
     """40 dB over the noise of a cell, between the grid's cells: nothing further is found in what
-    its removal leaves. Planted bug: `LEFT_OVER` nothing."""
+    its removal leaves. Planted bug: `RESIDUAL_SHARE` nothing."""
     w, schedule, payload = frame(waveform=SHORT)
     sent = known(w, schedule, payload, ANTENNAS)
     path = Path(60.0 + w.range_cell(1) * 0.47, 9.13, 6.0, (0.05, 0.02), (0.05, 0.02))
@@ -497,3 +500,39 @@ def test_waves_of_an_echo_over_a_wall_start_no_track():
     weak = replace(d, snr=np.array([2.0, 4, 5, 4, 4, 3]))
     leaked = replace(d, starts=np.arange(6) > 0)
     assert not over_walls(weak, cells, sent).any() and not over_walls(leaked, cells, sent).any()
+
+
+ARRAYS = {
+    "plane": ([[0, 0], [2, 0], [0, 2]], {"shape": "planar", "columns": 4, "rows": 4}),
+    "board": ([[0, 0], [1, 0.5], [2, 0]], {"shape": "linear", "columns": 4}),
+}
+
+
+@pytest.mark.parametrize("passes", [2, 1])
+@pytest.mark.parametrize("name", ARRAYS)
+def test_a_target_is_found_with_any_array(name, passes):
+    """A UAV at an active terminal, beside a wave in its cell that is 10 dB stronger and foretold,
+    and at a passive one, 32 dB under a line of sight: one detection is off by less than 4 of its
+    deviations and a quarter of a resolution on every axis that the array observes, and has no
+    direction on another. Planted bugs: X and Z exchanged in the search's steering; channels with
+    the next element's place; a direction on the axis that the board does not observe."""
+    w, schedule, payload = frame(waveform=SHORT)
+    tx, rx = ARRAYS[name]
+    antennas = antennas_of(Array.model_validate({"tx": {"positions": tx}, "rx": rx}), w)
+    place, u = np.array([17.31, 3.3]), (0.21, -0.13)
+    if passes == 2:
+        beside = Path(*2 * place, 1.0, (-0.55, 0.3), (-0.55, 0.3))
+        settings = Receivers(clutter_detector="angle_doppler")
+        paths = [Path(*2 * place, 0.3, u, u), beside]
+        samples = cube(w, schedule, payload, paths, antennas, 1.0, 3)
+        found = receive_active(samples, payload, antennas, settings, clutter=expected([beside]))
+    else:
+        sight, target = Path(11.2, 5.1, 6.0, (0.4, 0.1)), Path(*place, 0.15, u)
+        samples = cube(w, schedule, unmodulated(w), [sight, target], antennas, 1.0, 3)
+        settings = Receivers(passive_detector="beams")
+        found = receive_passive(samples, antennas, settings, 8, None, False)
+    d, sees = found.detections, np.array([True, True, *antennas.observes(passes)])
+    allowed = np.minimum(4 * d.std, resolutions(w, antennas, passes) / 4)
+    off = np.abs(d.measured - [*place, *u])
+    hit = np.flatnonzero((off < allowed)[:, sees].all(axis=1))
+    assert len(hit) == 1 and np.array_equal(np.isfinite(d.measured[hit[0]]), sees)
