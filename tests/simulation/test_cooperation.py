@@ -207,8 +207,9 @@ def test_odds_are_the_ratio_of_the_likelihoods_of_a_whole_record():
 
 def test_what_the_at_should_see_and_has_not_is_no_uav():
     """A UAV of the PT alone 6 m beside the target: the AT detects nothing there and it goes, until
-    it is detected; with a track of the AT's, or as a terminal, it stays. Planted bugs: detections
-    of the target beside it taken for its own; links of passive terminals asked."""
+    it is detected, also in a frame that the AT skips; with a track of the AT's, or as a terminal,
+    it stays. Planted bugs: detections of the target beside it taken for its own; links of passive
+    terminals asked; records forgotten in a frame without the AT's echoes."""
     exchange = Cooperation(prepare(scenario()))
     step = exchange._existing
     poses = exchange._setup.swarm.poses(0.05)
@@ -218,6 +219,7 @@ def test_what_the_at_should_see_and_has_not_is_no_uav():
     empty = SimpleNamespace(reception=SimpleNamespace(detections=no_detections()))
     frame = {Link("AT", "AT"): empty, Link("AT", "PT"): empty}
     assert step([alone], 3, poses, frame) == ()
+    assert step([alone], 4, poses, {Link("AT", "PT"): empty}) == ()
     for kept in (replace(alone, members=(of_pt, of_at)), replace(alone, terminal="PT")):
         exchange.state.records.clear()
         assert step([kept], 3, poses, frame) == (kept,)

@@ -10,13 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isac_rt.extensions.cooperation.fusion import JOIN_PROBABILITY, Detection, FusedTracks
-from isac_rt.extensions.cooperation.messages import (
-    CODE_RATE,
-    CORRECTED,
-    Channel,
-    Notes,
-    SelfReport,
-)
+from isac_rt.extensions.cooperation.messages import CODE_RATE, CORRECTED, Channel, Notes, SelfReport
 from isac_rt.frame.link import Link
 from isac_rt.frame.waveform import SPEED_OF_LIGHT
 from isac_rt.plain import Stateful
@@ -188,21 +182,23 @@ class Cooperation(Stateful):
         not. A passive terminal's errors near the line of sight and over unknown paths are larger
         than it knows: most tracks that it has alone are doubles of one that an active terminal has
         elsewhere."""
-        before, self.state.records = self.state.records, {}
-        odds = np.zeros(len(fused))
+        records, odds = self.state.records, {uav.name: 0.0 for uav in fused}
         for link in received:
             if not link.own:
                 continue
             hits = self._hits(fused, link, received[link], poses[link.rx])
-            for k, (uav, hit) in enumerate(zip(fused, hits, strict=True)):
-                record, place = before.get((uav.name, link), Record()), uav.state.mean[:3]
+            for uav, hit in zip(fused, hits, strict=True):
+                record, place = records.get((uav.name, link), Record()), uav.state.mean[:3]
                 tracked = str(link) in {key.origin for key in uav.members}
                 p = 1.0 if tracked else self._detection_probability(link, place, frame, poses)
                 if p > 0:
-                    record = record.after(p, tracked or bool(hit))
-                self.state.records[uav.name, link] = record
-                odds[k] += record.odds
-        return tuple(b for b, of in zip(fused, odds, strict=True) if b.terminal or of >= 0)
+                    records[uav.name, link] = record.after(p, tracked or bool(hit))
+        holds = self._setup.timetable.holds  # an active terminal may skip a frame
+        records = {k: r for k, r in records.items() if k[0] in odds and holds(k[1], frame)}
+        for (name, _), record in records.items():
+            odds[name] += record.odds
+        self.state.records = records
+        return tuple(uav for uav in fused if uav.terminal or odds[uav.name] >= 0)
 
     def _hits(
         self, fused: Sequence[Fused], link: Link, received: LinkResult, own: Pose
