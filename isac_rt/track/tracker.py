@@ -1,4 +1,4 @@
-"""Extended Kalman filter, association and the life of tracks.
+"""Association and management of tracks.
 
 A track is the world position, velocity and acceleration of one UAV. The terminal that keeps it
 knows its own pose, so what is reported is relative to it, and leaves the acceleration out. Names
@@ -109,7 +109,7 @@ class Track:
     hits : detections so far
     odds : logarithm of the odds that it follows a target (`isac_rt.track.existence`); infinite
         where tracks count on their hits alone
-    confirmed : M hits in N frames were reached, `SURE_HITS` of them sure
+    confirmed : enough hits were reached (`SURE_HITS`), and no rule took that back
     detection : row among the frame's detections that updated it, -1: none
     last : time of the last detection [s]
     sure : detections that could have started it
@@ -164,7 +164,7 @@ class TrackSet:
     age : (K,) int, frames since the first detection
     confirmed, is_reference : (K,) bool; `Track.credible`; the reference is a PT's track of its AT
     detection : (K,) int, row among the frame's detections that updated it, -1: none
-    snr : (K,) of the last detection, infinite where others report a body
+    snr : (K,) of the last detection, infinite where others report a target
     """
 
     ids: np.ndarray
@@ -395,8 +395,8 @@ class Tracker(Stateful):
                 track.confirmed &= sum(count >= own for count in most) == 1
 
     def _joined(self) -> list[Track]:
-        """Return the tracks, of confirmed ones in one place the oldest alone, as the one of them
-        that was found last has it."""
+        """Return the tracks, of confirmed ones in one place the oldest alone, with its record, as
+        the one of them that was found last has it."""
         out: list[Track] = []
         for track in self.tracks:
             joins, place = self.by_odds and track.confirmed, track.state.mean[:3]
@@ -405,7 +405,8 @@ class Tracker(Stateful):
             if not near:
                 out.append(track)
             elif track.missed < near[0].missed:
-                vars(near[0]).update(vars(track) | {"id": near[0].id, "age": near[0].age})
+                record = {name: vars(near[0])[name] for name in ("id", "age", "hits")}
+                vars(near[0]).update(vars(track) | record)
         return out
 
     def _live(self, track: Track, hit: bool, active: bool) -> None:
@@ -423,10 +424,9 @@ class Tracker(Stateful):
         track.confirmed = track.confirmed or enough
 
     def _dead(self, track: Track) -> bool:
-        """A confirmed track dies of `drop_misses` misses in a row, or of `drop_after_s` without a
-        detection, and where that is set also of as many misses as it had frames before; a tentative
-        one as soon as it can no longer be confirmed within its first
-        `confirm_window` frames."""
+        """A confirmed track ends after `drop_misses` misses in a row, or `drop_after_s` without a
+        detection, and where that is set also after as many misses as it had frames before; a
+        tentative one once it can no longer be confirmed in its first `confirm_window` frames."""
         s = self.settings
         if track.confirmed:
             late = s.drop_after_s is not None and (
