@@ -288,7 +288,7 @@ def expected(
     mean: np.ndarray, covariance: np.ndarray, own: Pose, transmitter: Gaussian | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return mean (..., 4) and covariance (..., 4, 4) of the measurements expected of states
-    (..., 9), without measurement noise.
+    (..., 6 or 9), without measurement noise.
 
     Unscented transform, with 12 points of position and velocity of equal weight: with a transversal
     velocity unknown by 10 m/s and 0.15 s between frames, the nonlinearity of the range rate exceeds

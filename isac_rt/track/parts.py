@@ -170,7 +170,7 @@ class OtherPaths(Stateful):
         return False
 
     def take_over(self, reference: Prediction, own: Ownship) -> None:
-        """Go on over a reference that is no line of sight, row 0, from the next frame on."""
+        """Go on over a reference that is no line of sight, row 0, from this frame on."""
 
     def read_frame(
         self,
@@ -183,12 +183,13 @@ class OtherPaths(Stateful):
         anchored: bool,
         maps: bool,
     ) -> tuple[Reception, bool]:
-        """Read a data frame that the reference does not read, over any path where one is known.
+        """Read a data frame that the reference does not read, over any path where one is known, or
+        learn a path from a frame without data.
 
         Parameters
         ----------
         refused : whether the reference that was found is no line of sight
-        anchored : whether the frame shows the line of sight without a prediction
+        anchored : whether the frame carries no data, and so shows paths without a prediction
 
         Returns
         -------

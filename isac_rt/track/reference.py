@@ -155,8 +155,7 @@ class Reference(Stateful):
 
     def is_plausible(self, reception: Reception, straight: float | None) -> bool:
         """Return whether the reference found is as strong as a line of sight of its length, as
-        transmit power and antennas are public, and as long as the place says that it
-        reports."""
+        transmit power and antennas are public, and no longer or shorter than the straight one."""
         d = reception.detections
         length = d.range[d.is_reference][0]
         strong = reception.reference_power * length**2 >= self._level / LEVEL_DROP

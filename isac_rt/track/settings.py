@@ -39,8 +39,8 @@ class Tracking(Node):
     short shadows."""
     drop_after_s: Positive | None = None
     """Time without a detection after which a confirmed track ends, whatever `drop_misses` says [s];
-    one that was seen for less long ends after as many frames as it was seen in. null, the default:
-    only `drop_misses` counts."""
+    a younger one ends after as many misses as it had frames before. null, the default: only
+    `drop_misses` counts."""
     target_size_m: Annotated[float, Field(ge=0, le=100)] = 0.0
     """Extent of the largest targets [m], such as 6 of cars: of detections nearer to each other only
     the strongest counts, and a track expects it anywhere on its target. By default 0: points."""

@@ -165,11 +165,7 @@ class ActiveTerminal(Stateful):
         return reception, tracks
 
     def receive(
-        self,
-        cube: IFCube,
-        payload: Payload,
-        clutter: ExpectedClutter | None,
-        maps: bool,
+        self, cube: IFCube, payload: Payload, clutter: ExpectedClutter | None, maps: bool
     ) -> Reception:
         """Return what the terminal makes of one frame's samples; custom receivers replace it."""
         return self._receiver.receive(cube, payload, Hints(clutter), maps=maps)
@@ -258,13 +254,7 @@ class PassiveTerminal(Stateful):
         if refused:
             reception = reception.without_reference()
         reception, anchored = self.equipment.other_paths.read_frame(
-            cube,
-            reception,
-            own,
-            self.reference,
-            refused=refused,
-            anchored=not modulated,
-            maps=maps,
+            cube, reception, own, self.reference, refused=refused, anchored=not modulated, maps=maps
         )
         if modulated:
             self.reference.state.read = reception.is_read

@@ -276,7 +276,7 @@ def one_detection(frames=1, reference=False):
 
 @pytest.mark.parametrize(("hits", "window", "misses"), [(2, 3, 2), (3, 4, 3), (1, 1, 2)])
 def test_the_life_of_a_track_over_all_patterns(hits, window, misses):
-    """All patterns of hits and misses over 7 frames after initiation: whether the first track lives
+    """All patterns of hits and misses over 6 frames after initiation: whether the first track lives
     and is confirmed, by the rule word for word. Planted bugs: one miss too many; the window one
     frame too long; a track that needs one hit not confirmed at once; age counted in hits."""
     settings = Tracking(confirm_hits=hits, confirm_window=window, drop_misses=misses)

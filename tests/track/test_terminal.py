@@ -99,7 +99,7 @@ def test_nothing_is_read_before_acquisition():
 
 
 def test_a_weak_reflection_is_not_taken_for_the_line_of_sight():
-    """14 dB under free space at its own length; planted bug: `_plausible` always true."""
+    """14 dB under free space at its own length; planted bug: `is_plausible` always true."""
     pt = terminal()
     step(pt, 0, [sight(0, scale=0.2)], False)
     assert pt.status is TerminalState.ACQUIRING

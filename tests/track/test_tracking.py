@@ -1,10 +1,9 @@
-"""EKF, association and the life of tracks."""
+"""EKF, association and management of tracks."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -381,8 +380,7 @@ def test_crossing_targets_keep_their_tracks():
     first, second = BODY.copy(), BODY.copy()
     second[:3] += [2.0, 4.0, 0.4]
     second[3:] = [-6.9, -1.0, 0.6]
-    tracker, settings = Tracker(Tracking(), Ambiguity(PERIOD)), Tracking()
-    assert settings.confirm_hits == 3
+    tracker = Tracker(Tracking(), Ambiguity(PERIOD))
     owner: dict[int, int] = {}
     nearest = np.inf
     for k, states, tracks in fly(tracker, 60, [first, second], 0.02, 8):
@@ -497,20 +495,6 @@ def test_a_bistatic_track_finds_the_reflector():
     error = tracks.mean[0] - (move[0] - np.concatenate([own.position, own.velocity]))
     deviation = np.sqrt(np.diag(tracks.covariance[0]))
     assert (np.abs(error) < 4 * deviation).all() and deviation[:3].max() < 0.5
-
-
-def test_ids_are_deterministic():
-    runs = []
-    for _ in range(2):
-        tracker = Tracker(Tracking(), Ambiguity(PERIOD))
-        runs.append(
-            [
-                tracks.ids.tolist()
-                for _, _, tracks in fly(tracker, 15, [BODY, BODY + 2.5], 0.02, 6, {4, 5})
-            ]
-        )
-    assert runs[0] == runs[1]
-    assert all(a <= b for ids in runs[0] for a, b in pairwise(ids))
 
 
 def test_a_track_says_which_detection_updated_it():

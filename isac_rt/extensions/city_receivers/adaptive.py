@@ -136,11 +136,7 @@ class DirectionTest:
 
     @classmethod
     def of(
-        cls,
-        settings: Receivers,
-        known: Known,
-        power: np.ndarray,
-        clutter: ExpectedClutter | None,
+        cls, settings: Receivers, known: Known, power: np.ndarray, clutter: ExpectedClutter | None
     ) -> DirectionTest:
         """Return the test of a frame of such mean power (rows, P) of a channel."""
         own, antennas = known.passes == 2, known.antennas

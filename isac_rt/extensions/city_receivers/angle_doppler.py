@@ -87,13 +87,12 @@ class AngleDoppler:
         detections = describe(found, snr, known, on_grid=self.estimator.on_grid, mixed=TWO_WAVES)
         towards, limit = np.array(direction).reshape(-1, 2), known.antennas.view_limit
         towards = np.where(np.abs(towards) <= limit, towards, np.nan)
-        detections = replace(detections, direction=towards)
         sure = ratio[rows, bins] * (test.limits[0] / test.limits[1])
         # where there is no clutter a UAV's echo is one wave
         starts = (share * sure > 1) & (detections.starts | test.filled[rows, bins])
         if first:
             starts &= ~in_sidelobe(rows, bins, power, first, known)
-        detections = replace(detections, starts=starts)
+        detections = replace(detections, direction=towards, starts=starts)
         starts = starts & ~over_walls(detections, np.column_stack([rows, bins]), known)
         kept = np.flatnonzero((number == 0) | ~repeated(detections, known))
         detections = replace(detections, starts=starts).select(kept)

@@ -38,9 +38,9 @@ STEPS = 6
 SETTLED = 0.02
 """Step of the level's logarithm and of the velocity [m/s] from which on the fit stands."""
 ALIKE = 0.05
-"""Velocities [m/s] so near to each other, an eighth of a Doppler bin, have the same slopes."""
+"""Velocities [m/s] so near to each other, a fifth of a Doppler bin, have the same slopes."""
 LONGEST_STEP = np.array([1.0, 0.1, 0.1, 0.1])
-"""Of the level's logarithm and the velocity [m/s]; a quarter of a Doppler bin is well inside the
+"""Of the level's logarithm and the velocity [m/s]; 0.4 of a Doppler bin is well inside the
 response's main lobe."""
 
 

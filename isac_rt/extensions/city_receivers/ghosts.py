@@ -37,6 +37,10 @@ MEETING = 1e-9
 RESOLUTION_SHARE = 0.5
 """Share of the resolution that it may be off besides: echoes that share a cell pull each other's
 estimates."""
+ONE_WAY_SHARE = 2.0
+"""The same for the direction of an echo over a wall on one way at an active terminal: its transmit
+antennas see another direction than its receive antennas, so that the halves of the virtual array do
+not join, and the receive antennas' resolution is twice as wide."""
 ECHO_WAVES = 2.0
 """Waves of equal power that an echo over a wall on one way consists of: out over the wall, and
 back."""
@@ -46,10 +50,6 @@ on both are."""
 CROSSING_M = 3.0
 """Tracks that were reported before are held against the walls so near to them [m]: one that lay
 before all walls comes by here on its way behind one."""
-ONE_WAY_SHARE = 2.0
-"""The same for the direction of an echo over a wall on one way at an active terminal: its transmit
-antennas see another direction than its receive antennas, so that the halves of the virtual array do
-not join, and the receive antennas' resolution is twice as wide."""
 
 
 class Ghosts(TrackRule):
@@ -279,11 +279,7 @@ def echoes(
 
 
 def reflections(
-    state: np.ndarray,
-    sender: np.ndarray | None,
-    own: Pose,
-    walls: Walls,
-    reach: float = np.inf,
+    state: np.ndarray, sender: np.ndarray | None, own: Pose, walls: Walls, reach: float = np.inf
 ) -> list[tuple[int, int, np.ndarray]]:
     """Return a target's paths over walls at a passive terminal, one wall on each segment at most:
     (first face, order, (4,) path length, its rate, u_x, u_z), images beyond `reach` [m] of either

@@ -29,7 +29,7 @@ from isac_rt.world.swarm import Pose
 WELL_INSIDE = 0.95
 """Share of the view's largest cosines within which a direction is no alias of one outside."""
 ALIAS_DEVIATIONS = 3.0
-"""So many deviations further inside at a passive terminal, whose array is a third as long."""
+"""So many deviations further inside at a passive terminal, whose array is half as long."""
 
 
 class Images(TrackRule):

@@ -101,11 +101,7 @@ class StaticClutter(TrackRule):
         tracker.drop(still | (fed & own.tentative))
 
     def update(
-        self,
-        d: Detections,
-        own: Pose,
-        time: float,
-        sender: np.ndarray | None = None,
+        self, d: Detections, own: Pose, time: float, sender: np.ndarray | None = None
     ) -> np.ndarray:
         """Take down a frame's echoes that stand still, of those that may start a track. What would
         stand still in a direction that it may be an alias of stands there.

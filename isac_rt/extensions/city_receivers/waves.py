@@ -76,11 +76,7 @@ class Wave:
 
 
 def waves_of(
-    x: np.ndarray,
-    inverse: np.ndarray,
-    first: np.ndarray,
-    search: Search,
-    ratio: float,
+    x: np.ndarray, inverse: np.ndarray, first: np.ndarray, search: Search, ratio: float
 ) -> list[Wave]:
     """Return the waves of a cell, that of the detection first.
 

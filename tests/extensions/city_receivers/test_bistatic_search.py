@@ -79,8 +79,8 @@ def test_the_bounds_miss_nothing():
 def test_false_alarms_in_clutter_are_no_more_than_those_designed(together: bool):
     """Clutter of eight directions, 3 to 20 dB, in every cell; heard alike by all transmit antennas,
     or by each for itself: at 1e-3 of 12,000 cells at most 25 alarms (12 expected; chance makes 25
-    in 1 of 2000). Planted bugs: no whitening (all cells); the wider tail of what is heard alike
-    left out (40)."""
+    in 1 of 2000), and some. Planted bugs: no whitening (all cells); the wider tail of what is heard
+    alike left out (40); nothing found."""
     rng = np.random.default_rng(7)
     u, count = rng.uniform(-0.6, 0.6, (8, 2)), 12_000
     power = 10 ** rng.uniform(0.3, 2.0, 8)
@@ -90,7 +90,7 @@ def test_false_alarms_in_clutter_are_no_more_than_those_designed(together: bool)
     x = white(rng, count, LOOKS, SIZE) + sent @ steer
     each = np.broadcast_to(R.astype(np.complex64), (count, SIZE, SIZE))
     found, common = search_white(x.astype(np.complex64), each, np.arange(count), SEARCH)
-    assert (found.peak > limit(1e-3) * common).sum() <= 25
+    assert 0 < (found.peak > limit(1e-3) * common).sum() <= 25
 
 
 @pytest.mark.parametrize("place", [(25.7, 5.4), (22.9, 2.4)])

@@ -307,19 +307,9 @@ def test_reflections_at_a_passive_terminal_are_the_shortest_ways():
     way touches the wall. Tolerances as for the echoes. Planted bugs: arrival from the body where
     the last way is over the wall; the rate of one way only."""
     here = np.concatenate([OWN.position - ORIGIN, OWN.velocity])
-    found = {
-        order_of: echo
-        for order_of, echo in zip(
-            ("back", "out", "both"),
-            (e for _, _, e in reflections(BODY - here, SENDER - here, OWN, Walls(wall()))),
-            strict=True,
-        )
-    }
-    assert [o for _, o, _ in reflections(BODY - here, SENDER - here, OWN, Walls(wall()))] == [
-        1,
-        1,
-        2,
-    ]
+    shown = reflections(BODY - here, SENDER - here, OWN, Walls(wall()))
+    assert [order for _, order, _ in shown] == [1, 1, 2]
+    found = dict(zip(("back", "out", "both"), (echo for *_, echo in shown), strict=True))
     ((_, order, own_echo),) = reflections(SENDER - here, None, OWN, Walls(wall()))
     assert order == 1
     found["sender"] = own_echo
@@ -386,14 +376,8 @@ def test_a_passive_terminal_suspects_its_ghosts():
     one_pass = RESOLUTION * [2, 2, 3, 3]
     found = suspicion(everyone, OWN, Walls(wall()), Leeway(one_pass, Ambiguity(2 * PERIOD)))
     assert found.suspect.tolist() == [False, False, True, True, True, False]
-    assert found.source.tolist() == [-1, -1, 3, 3, 1, -1] and found.order.tolist() == [
-        0,
-        0,
-        1,
-        1,
-        1,
-        0,
-    ]
+    assert found.source.tolist() == [-1, -1, 3, 3, 1, -1]
+    assert found.order.tolist() == [0, 0, 1, 1, 1, 0]
 
 
 def test_a_place_that_the_sender_cannot_see_is_suspect_at_a_passive_terminal():
