@@ -245,7 +245,7 @@ MAX_LINES = {
     "track": 1968,
     "scenario": 2212,
     "results": 3745,
-    "simulation": 3775,
+    "simulation": 3786,
     "sweep": 2784,
     "views": 3676,
     "cli": 2314,

@@ -100,6 +100,7 @@ class Scorer(Stateful):
         sent: Transmission,
         received: LinkResult,
         noise_power: float,
+        parts: PathSet | None = None,
     ) -> ObserverRecord:
         """Score one frame and describe it.
 
@@ -110,11 +111,13 @@ class Scorer(Stateful):
         sent : what that transmitter sent
         received : what the receiver made of it
         noise_power : per sample at the receiver [W]
+        parts : which label detections: `paths`, those of targets replaced by those of their parts
         """
         reception, timetable, tracks = received.reception, self._timetable, received.tracks
+        parts = paths if parts is None else parts
         view = self._view(frame, paths)
         sees = self._sensitivity(frame, sent, noise_power)
-        labels = self._labels_of(reception.detections, paths, sees, view.directions)
+        labels = self._labels_of(reception.detections, parts, sees, view.pose)
         reported = self._reported(frame)
         seen = np.isin(np.arange(len(view.truth)), list(view.seen))
         causes = self._latest(tracks, labels)
@@ -224,8 +227,7 @@ class Scorer(Stateful):
         direct = np.isin(np.arange(len(names)), straight[rows])
         seen = {i: t for i, t in enumerate(truth) if t is not None and inside[i] and direct[i]}
         positions = np.array([poses[name].position - pose.position for name in names])
-        directions = pose.to_body(paths.arrival)[:, ::2]
-        return _View(pose, truth, inside, direct, straight, seen, positions, directions)
+        return _View(pose, truth, inside, direct, straight, seen, positions)
 
     def _reported(self, frame: int) -> np.ndarray:
         """(U,) UAVs that are terminals in a frame and report their position; none in a swarm of
@@ -249,10 +251,10 @@ class Scorer(Stateful):
         )
 
     def _labels_of(
-        self, d: Detections, paths: PathSet, sees: Sensitivity, directions: np.ndarray
+        self, d: Detections, paths: PathSet, sees: Sensitivity, pose: Pose
     ) -> DetectionLabels:
         beam = np.where(self._resolution.observed, self._resolution.width[2:], np.inf)
-        aim = Aim(directions, beam)
+        aim = Aim(pose.to_body(paths.arrival)[:, ::2], beam)
         labels = explain(d, paths, self._timetable.waveform, self._passes, sees.cell, aim)
         names = list(self._swarm.uavs)
         uav = owners(labels.kind, labels.target, paths, names)
@@ -391,7 +393,6 @@ class _View:
     straight : (K,) index of the UAV whose own straight path each path is, -1: none's
     seen : the truth of those in view and unoccluded, by index
     positions : (U, 3) relative to the receiver [m]
-    directions : (K, 2) u_x, u_z from which each path arrives
     """
 
     pose: Pose
@@ -401,7 +402,6 @@ class _View:
     straight: np.ndarray
     seen: dict[int, Truth]
     positions: np.ndarray
-    directions: np.ndarray
 
 
 def _reference_snr(paths: PathSet, amplitude: float, noise_power: float) -> float:

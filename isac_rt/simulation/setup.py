@@ -193,6 +193,16 @@ class Frame:
             out += [(stream, paths) for stream in sent.streams()]
         return out
 
+    def parts(self, link: Link) -> PathSet:
+        """Return a link's paths with those over the scattering centres of rigid targets in place of
+        the targets' own."""
+        paths, centres = self.paths[link], self._setup.moving_centres
+        if centres is not None:
+            rigid = [(name, model) for name, model in centres.models if not model.speed]
+            centres = replace(centres, models=rigid, own={})
+            paths = centres.with_centres(paths, self.poses, paths.epoch)
+        return paths
+
     def _moving(self, paths: PathSet, when: float, least: float) -> PathSet:
         """Return the paths of a link with moving centres and shadows that change in the frame.
 

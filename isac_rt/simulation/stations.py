@@ -174,7 +174,8 @@ class Station:
     def record(self, frame: Frame, received: LinkResult) -> ObserverRecord:
         """Compare the frame with the truth."""
         paths, sent = frame.paths[self.link], frame.sent[self.link.tx]
-        return self.scorer.record(frame.number, paths, sent, received, frame.noise_power(self.link))
+        noise, parts = frame.noise_power(self.link), frame.parts(self.link)
+        return self.scorer.record(frame.number, paths, sent, received, noise, parts)
 
 
 class Exchange(Protocol):

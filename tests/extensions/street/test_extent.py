@@ -24,6 +24,7 @@ from isac_rt.extensions.street.centres import MovingCentres, body_axes
 from isac_rt.extensions.street.extent import KINDS, fixed_of, of_several
 from isac_rt.extensions.street.walker import walker_of_flight
 from isac_rt.frame.antennas import Antennas, Arrays
+from isac_rt.propagation.pathset import PathKind
 from isac_rt.propagation.rcs import CrossSection
 from isac_rt.receive.types import Detections
 from isac_rt.track.tracker import spread
@@ -345,6 +346,17 @@ def test_a_target_with_extent_is_one_track(body, place, speed, size):
     assert run.summary["terminals"]["radar"]["false_tracks_per_frame"] == 0
     if size > 5:
         assert tracks_by_frame(irt.run(points, progress=False, snapshots=0).dataset).max() > 2
+
+
+@pytest.mark.parametrize(("place", "speed"), [((2, 22, 1), 3), ((-3, 9, 1), 4)])
+def test_detections_of_a_cars_parts_are_its_own(place, speed):
+    """As its faces are cells apart, its own path explains a third of them. Planted bug: paths as
+    they are drawn."""
+    flight = {"position_m": place, "velocity_mps": (0, -speed, 0)}
+    run = irt.run(scene(flight | VEHICLE, frames=4, chirps=96), progress=False, snapshots=0)
+    kinds = run.dataset.det_kind.values
+    assert len(kinds) >= 8 and (kinds == PathKind.TARGET).all()
+    assert run.summary["terminals"]["radar"]["false_per_frame"] == 0
 
 
 @pytest.mark.parametrize(
