@@ -237,6 +237,6 @@ class Notes(Stateful):
         return tuple(time - at for at in newest.values())
 
 
-def _newer(word: SelfReport | TrackNumbers, known: SelfReport | TrackNumbers | None) -> bool:
-    """Return whether a word is newer than what is known."""
-    return known is None or word.time > known.time
+def _newer(report: SelfReport | TrackNumbers, known: SelfReport | TrackNumbers | None) -> bool:
+    """Return whether a report is newer than what is known."""
+    return known is None or report.time > known.time

@@ -203,8 +203,9 @@ def test_a_late_detection_is_taken_up_in_its_order():
     fuse(late, 0.4, [*of_a, every[1], *every[5::4]])
     found = fuse(late, 0.4, every[::-1])
     assert len(expected) == len(found) == 1
-    assert np.allclose(found[0].state.mean, expected[0].state.mean, rtol=1e-12)
-    assert np.allclose(found[0].state.covariance, expected[0].state.covariance, rtol=1e-9)
+    one, other = found[0].state, expected[0].state
+    np.testing.assert_allclose(one.mean, other.mean, rtol=1e-12, atol=0)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-9, atol=0)
     later = detection("A->A", 0.4 + 2 * HOLD_S)
     (before,) = fuse(late, later.time, [*every, later])
     (after,) = fuse(late, later.time, [*every, later, detection("A->B", 0.02)])
