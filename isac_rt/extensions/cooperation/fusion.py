@@ -252,6 +252,8 @@ class FusedTracks(Stateful):
                 alone.change([d for d in found if d.key == key])
                 uav.change([d for d in found if d.key != key])
                 self.state.uavs.append(alone)
+        # detections without a direction may fix no place
+        self.state.uavs = [uav for uav in self.state.uavs if uav.found or uav.base]
 
     def _join(self, time: float) -> list[Gaussian]:
         """Join UAVs of different terminals, or nearer than UAVs fly, as many as the gate allows, of
