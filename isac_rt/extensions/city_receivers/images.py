@@ -46,9 +46,8 @@ class Images(TrackRule):
         self._walls, self._passes = walls, passes
         self._edge = WELL_INSIDE * antennas.view_limit
         self._ambiguity = Ambiguity.of(waveform, passes)
-        cells = np.array([waveform.range_cell(passes), waveform.velocity_cell(passes)])
-        self._beside = MAIN_LOBE * cells
-        self._beam = resolutions(waveform, antennas, 1)[2:]
+        cells = resolutions(waveform, antennas, passes)
+        self._beside, self._beam = MAIN_LOBE * cells[:2], cells[2:]
         self._cosine_period = antennas.cosine_period(waveform.wavelength, passes)
 
     def candidates(self, detections: Detections, own: Ownship) -> Detections:

@@ -102,18 +102,15 @@ class OutOfSequence(OtherPaths):
         if out is None:
             return reception, False
         out = replace(out, detections=delayed(out.detections, own.clock, -1))
-        if (
-            out.line_of_sight
-            and reference.is_plausible(out, own.straight)
-            and self._is_well_inside(out)
-        ):
+        strong = out.line_of_sight and reference.is_plausible(out, own.straight)
+        if strong and self._is_well_inside(out):
             self.forget()
             return out, True
         return out.without_sight(self._is_named(own)), False
 
     def _is_named(self, own: Ownship) -> bool:
-        """Return whether the path that is read over is as long, and changes as fast, as a path from
-        the transmitter over the city's walls or about an edge."""
+        """Return whether the path that is read over is as long, and changes as fast, as one from
+        the transmitter over the city's walls, or straight, as it almost is about an edge."""
         path = self.state.path
         if self._walls is None or path is None or not own.over_other_path or own.sender is None:
             return False

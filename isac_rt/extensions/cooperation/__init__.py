@@ -1,1 +1,1 @@
-"""Fused tracks of cooperating terminals, by messages with tracks or with detections."""
+"""Fused tracks of cooperating terminals, which exchange the detections of their tracks."""
