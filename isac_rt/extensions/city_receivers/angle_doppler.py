@@ -66,9 +66,10 @@ class AngleDoppler:
         level, first = test.noise + test.expected, first_row(self.settings, known.range_cell)
         ratio[:first] = 0
         rows, bins = strongest_peaks(ratio, ratio > 1, self.settings, UNION_FLOOR)
-        found, direction, cells, waves = [], [], [], []
+        found, direction, told, cells, waves = [], [], [], [], []
         for cell in zip(rows.tolist(), bins.tolist(), strict=True):
             x = maps[:, :, cell[0], (cell[1] + maps.shape[3] // 2) % maps.shape[3]].ravel()
+            x = x / np.sqrt(test.noise)
             inverse = test.inverse(*cell)
             for wave in waves_of(x, inverse, cosines[cell], test.search, float(ratio[cell])):
                 beam = wave.weights.reshape(known.antennas.num_tx, -1).conj()
@@ -78,7 +79,8 @@ class AngleDoppler:
                 towards = wave.cosines
                 if not self.estimator.on_grid:
                     towards = near_beam(estimate, known, towards, inverse)
-                direction.append(towards)
+                direction.append(np.where(wave.told, towards, np.nan))
+                told.append(wave.told)
                 cells.append(cell)
                 waves.append((wave.share, wave.number))
         rows, bins = np.array(cells, int).reshape(-1, 2).T
@@ -87,12 +89,14 @@ class AngleDoppler:
         detections = describe(found, snr, known, on_grid=self.estimator.on_grid, mixed=TWO_WAVES)
         towards, limit = np.array(direction).reshape(-1, 2), known.antennas.view_limit
         towards = np.where(np.abs(towards) <= limit, towards, np.nan)
+        std = detections.std.copy()
+        std[:, 2:][~np.array(told, bool).reshape(-1, 2)] = np.inf
         sure = ratio[rows, bins] * (test.limits[0] / test.limits[1])
         # where there is no clutter a UAV's echo is one wave
         starts = (share * sure > 1) & (detections.starts | test.filled[rows, bins])
         if first:
             starts &= ~in_sidelobe(rows, bins, power, first, known)
-        detections = replace(detections, direction=towards, starts=starts)
+        detections = replace(detections, direction=towards, std=std, starts=starts)
         starts = starts & ~over_walls(detections, np.column_stack([rows, bins]), known)
         kept = np.flatnonzero((number == 0) | ~repeated(detections, known))
         detections = replace(detections, starts=starts).select(kept)

@@ -4,13 +4,13 @@ A wall that is met at a right angle sends the terminal's chirps straight back, a
 of two planes, wall and ground above all, whatever the angle. Such an echo stands still in the world
 but is a point as a UAV is, and the scatterers of the expected clutter do not hold it. The terminal
 knows its pose and the mesh, so that it knows the range of each and its rate. A passive terminal
-knows its transmitter's, and the images of that one's line of sight. Occlusion by other
-buildings is not asked for: an image that is not there only forbids initiation in a few cells.
+knows its transmitter's, and the images of that one's line of sight.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,7 +43,7 @@ class Images(TrackRule):
     """
 
     def __init__(self, walls: Walls, antennas: Antennas, waveform: Waveform, passes: int) -> None:
-        self._walls, self._passes = walls, passes
+        self._walls, self._passes, self._antennas = walls, passes, antennas
         self._edge = WELL_INSIDE * antennas.view_limit
         self._ambiguity = Ambiguity.of(waveform, passes)
         cells = resolutions(waveform, antennas, passes)
@@ -63,47 +63,58 @@ class Images(TrackRule):
     def _beside_images(self, d: Detections, own: Ownship) -> np.ndarray:
         """(Q,) which detections lie within an image's main lobe: at a passive terminal in direction
         too, or in an alias of it."""
-        reach = float(d.range.max()) + 1
+        reach, here = float(d.range.max()) + 1, own.pose
         if self._passes == 2:
-            shown = own_images(own.pose, self._walls, reach)
+            start = np.concatenate([here.position, here.velocity])
+            known = Ways.of_own(here, self._walls, reach)
         elif own.transmitter is not None:
-            shown = sender_images(own.transmitter.mean[:6], own.pose, self._walls, reach)
+            start = own.transmitter.mean[:6]
+            known = Ways.of_sender(start, here, self._walls, reach)
         else:
             return np.zeros(len(d), bool)
-        off = np.abs(wrapped(d.measured[:, None, :2] - shown[:, :2], self._ambiguity))
+        off = np.abs(wrapped(d.measured[:, None, :2] - known.seen[:, :2], self._ambiguity))
         beside = (off < self._beside).all(axis=-1)
         if self._passes == 1:
-            away = np.abs(folded(d.direction[:, None] - shown[:, 2:], self._cosine_period))
+            away = np.abs(folded(d.direction[:, None] - known.seen[:, 2:], self._cosine_period))
             beside &= (away < self._beam + ALIAS_DEVIATIONS * d.std[:, None, 2:]).all(axis=-1)
+        gain = self._antennas.element_gain(here.to_body(known.images[:, :3] - here.position))
+        for k in np.flatnonzero(beside.any(axis=0)):
+            points = np.array([start[:3], *known.points[k], here.position])
+            beside[:, k] &= gain[k] > 0 and not self._walls.block(points)
         return np.asarray(beside.any(axis=1))
 
 
-def own_images(own: Pose, walls: Walls, reach: float) -> np.ndarray:
-    """Range [m] and its rate [m/s] of the terminal's own images, one way as its echoes: (K, 2).
+class Ways(NamedTuple):
+    """Ways over one plane or two to a terminal.
 
-    Parameters
+    Attributes
     ----------
-    own : pose, world coordinates
-    reach : farthest range that counts [m]
+    images : (K, 6) from where waves seem to come, world coordinates
+    points : (K, 2, 3) where they meet planes; the same twice where it is one
+    seen : (K, 4) length [m], its rate [m/s] and direction cosines; of own images half of both, as
+        of echoes
     """
-    near = walls.near(own, reach)
-    here = np.concatenate([own.position, own.velocity])
-    return measure(_images(here, here, walls, (near, near), 2 * reach), own)[:, :2] / 2
 
+    images: np.ndarray
+    points: np.ndarray
+    seen: np.ndarray
 
-def sender_images(sender: np.ndarray, own: Pose, walls: Walls, reach: float) -> np.ndarray:
-    """Length [m], its rate [m/s] and direction cosines of the ways from a transmitter to a passive
-    terminal over one or two planes: (K, 4).
+    @classmethod
+    def of_own(cls, own: Pose, walls: Walls, reach: float) -> Ways:
+        """A terminal's own images up to a range [m]."""
+        near = walls.near(own, reach)
+        here = np.concatenate([own.position, own.velocity])
+        found = _images(here, here, walls, (near, near), 2 * reach)
+        return cls(*found, measure(found[0], own) * [0.5, 0.5, 1, 1])
 
-    Parameters
-    ----------
-    sender : (6,) position and velocity of the transmitter, world coordinates
-    own : pose of the terminal
-    reach : longest way that counts [m]
-    """
-    here = np.concatenate([own.position, own.velocity])
-    near = walls.about(sender[:3], reach), walls.near(own, reach)
-    return measure(_images(sender, here, walls, near, reach), own)
+    @classmethod
+    def of_sender(cls, sender: np.ndarray, own: Pose, walls: Walls, reach: float) -> Ways:
+        """Ways of at most `reach` [m] from a transmitter (6,), position and velocity in world
+        coordinates, to a passive terminal."""
+        here = np.concatenate([own.position, own.velocity])
+        near = walls.about(sender[:3], reach), walls.near(own, reach)
+        found = _images(sender, here, walls, near, reach)
+        return cls(*found, measure(found[0], own))
 
 
 def _images(
@@ -112,19 +123,26 @@ def _images(
     walls: Walls,
     near: tuple[np.ndarray, np.ndarray],
     reach: float,
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Images (K, 6) of `start` (6,) that `end` (6,) sees, over mirrors that are near the one and
-    the other."""
-    return np.concatenate(
-        [_by_one(start, end, walls, near[1], reach), _by_two(start, end, walls, near, reach)]
-    )
+    the other, and where their waves meet the mirrors (K, 2, 3)."""
+    parts = _by_one(start, end, walls, near[1], reach), _by_two(start, end, walls, near, reach)
+    images, points = zip(*parts, strict=True)
+    return np.concatenate(images), np.concatenate(points)
 
 
 def _by_one(
     start: np.ndarray, end: np.ndarray, walls: Walls, near: np.ndarray, reach: float
-) -> np.ndarray:
-    _, images = walls.images(start, end, reach, EDGE, near)
-    return images[np.linalg.norm(images[:, :3] - end[:3], axis=1) > 2 * LEAST_RANGE]
+) -> tuple[np.ndarray, np.ndarray]:
+    which, images = walls.images(start, end, reach, EDGE, near)
+    far = np.linalg.norm(images[:, :3] - end[:3], axis=1) > 2 * LEAST_RANGE
+    which, images = which[far], images[far]
+    _, normals, offsets = walls.mirrors
+    before = normals[which] @ end[:3] - offsets[which]
+    span = images[:, :3] - end[:3]
+    share = -before / np.vecdot(normals[which], span)
+    met_at = end[:3] + share[:, None] * span
+    return images, np.stack([met_at, met_at], axis=1)
 
 
 def _by_two(
@@ -133,18 +151,33 @@ def _by_two(
     walls: Walls,
     near: tuple[np.ndarray, np.ndarray],
     reach: float,
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """The wave over plane i, then j, comes from the image p_ij of the start's image in i; it meets
-    j at B, and i at A."""
+    j at B, and i at A. A = B is a corner, which sends back if each plane goes on in front of the
+    other: that of a house does not."""
     _, normals, offsets = walls.mirrors
     pairs, places = met(start[:3], end[:3], normals, offsets, *walls.boxes, *near, reach)
     i, j = pairs.T
     A, B, at_j = places.swapaxes(0, 1)
     kept = np.flatnonzero(walls.holds(i, A, EDGE))
     kept = kept[walls.holds(j[kept], B[kept], EDGE)]
-    n, m, at_j = normals[i[kept]], normals[j[kept]], at_j[kept]
+    i, j, A, B, at_j = (of[kept] for of in (i, j, A, B, at_j))
+    n, m = (  # towards the ends
+        np.sign(normals[k] @ end_of[:3] - offsets[k])[:, None] * normals[k]
+        for k, end_of in ((i, start), (j, end))
+    )
+    sends = np.linalg.norm(A - B, axis=1) > EDGE
+    goes_on = [
+        walls.holds(k, place + 2 * EDGE * _unit(other - np.vecdot(n, m)[:, None] * own), 0.0)
+        for k, place, own, other in ((i, A, n, m), (j, B, m, n))
+    ]
+    sends |= goes_on[0] & goes_on[1]
     turned = mirror_image(mirror_image(start[3:], n), m)
-    return np.hstack([at_j, turned])
+    return np.hstack([at_j, turned])[sends], np.stack([A, B], axis=1)[sends]
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
 @twin_of(track_images.met)

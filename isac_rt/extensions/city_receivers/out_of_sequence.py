@@ -15,7 +15,7 @@ import numpy as np
 
 from isac_rt.extensions.city_receivers.blind import DataPath, Peaks, acquire, find_peaks, read_peaks
 from isac_rt.extensions.city_receivers.ghosts import Leeway
-from isac_rt.extensions.city_receivers.images import WELL_INSIDE, sender_images
+from isac_rt.extensions.city_receivers.images import WELL_INSIDE, Ways
 from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import folded
 from isac_rt.frame.cube import IFCube
@@ -117,7 +117,7 @@ class OutOfSequence(OtherPaths):
         there = own.sender.state.mean
         length = path.mean[:2] - SPEED_OF_LIGHT * own.clock
         straight = measure(there, own.pose)[None, :2]
-        over_walls = sender_images(there[:6], own.pose, self._walls, float(length[0]) + 1)
+        over_walls = Ways.of_sender(there[:6], own.pose, self._walls, float(length[0]) + 1).seen
         difference = np.abs(np.concatenate([straight, over_walls[:, :2]]) - length)
         return bool((difference < NAMED_CELLS * self._cells).all(axis=1).any())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from isac_rt.world.swarm import Pose
 SMALLEST_WALL = 8.0
 """Area of a plane's faces together [m^2] below which it is not taken for a mirror: bays and gables
 of 10 m^2 showed UAVs over San Francisco."""
+AT_WALL = 1e-4
+"""Share of a segment at its ends that may touch what it ends on."""
 
 
 @dataclass(frozen=True)
@@ -145,9 +148,20 @@ class Walls:
 
     def blocking(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Faces (n,) that the open segment between two points (3,) crosses."""
-        origin = self.city.origin
-        faces, share = hits(self.city.corners, start - origin, end - origin)
-        return faces[(share > 0) & (share < 1)]
+        ends = np.array([start, end]) - self.city.origin
+        low, high = self.city.boxes
+        beside = (low <= ends.max(axis=0)) & (high >= ends.min(axis=0))
+        near = np.flatnonzero(beside.all(axis=1))
+        faces, share = hits(self.city.corners[near], *ends)
+        return near[faces[(share > 0) & (share < 1)]]
+
+    def block(self, polyline: np.ndarray) -> bool:
+        """Return whether a face crosses a segment of a polyline (P, 3), but for its ends."""
+        for start, end in pairwise(polyline):
+            inset = AT_WALL * (end - start)
+            if self.blocking(start + inset, end - inset).size:
+                return True
+        return False
 
 
 def lengths(targets: np.ndarray, end: np.ndarray) -> np.ndarray:

@@ -53,6 +53,8 @@ class Wave:
     steering : (L, K) of all
     number : which of these it is
     inverse : (L, L) R^-1
+    told : (2,) bool, axes on which its direction is known to half a beam: clutter may leave other
+        lobes about as likely
     """
 
     cosines: np.ndarray
@@ -61,6 +63,7 @@ class Wave:
     steering: np.ndarray
     number: int
     inverse: np.ndarray
+    told: np.ndarray
 
     def alone(self, estimate: Estimate, search: Search) -> Estimate:
         """Return the estimate with the other waves taken out of its channels."""
@@ -82,7 +85,7 @@ def waves_of(
 
     Parameters
     ----------
-    x : (L,) channels of the cell
+    x : (L,) channels of the cell, in units of the noise
     inverse : (L, L) R^-1 of noise and clutter
     first : (2,) direction of the detection
     ratio : its statistic over the threshold, which further waves have to exceed, too
@@ -101,7 +104,8 @@ def waves_of(
     for k in range(len(u)):
         Q = nulled(inverse, np.delete(A, k, axis=1))
         share = float(_statistic(x, Q, u[k], search)) / alone
-        out.append(Wave(u[k], share, Q @ A[:, k], A, k, inverse))
+        told = _deviations(x, Q, u[k], search) <= search.beam / 2
+        out.append(Wave(u[k], share, Q @ A[:, k], A, k, inverse, told))
     return out
 
 
@@ -124,6 +128,19 @@ def _further(
     return float(peak[0]), cosines
 
 
+def _deviations(x: np.ndarray, Q: np.ndarray, cosines: np.ndarray, search: Search) -> np.ndarray:
+    """Return the standard deviations (2,) of the likelihood exp(T) along each axis, through a
+    peak."""
+    out = np.zeros(2)
+    for axis, values in enumerate(search.cosines):
+        u = np.tile(cosines, (values.size, 1))
+        u[:, axis] = values
+        T = np.where((u**2).sum(axis=1) <= 1, _statistic(x, Q, u, search), 0.0)
+        weight = np.exp(T - T.max()) / np.exp(T - T.max()).sum()
+        out[axis] = np.sqrt(weight @ (values - weight @ values) ** 2)
+    return out
+
+
 def _statistic(x: np.ndarray, Q: np.ndarray, cosines: np.ndarray, search: Search) -> np.ndarray:
     a = search.steering(cosines)
-    return np.asarray(abs(a.conj() @ Q @ x) ** 2 / (a.conj() @ Q @ a).real)
+    return np.asarray(abs(a.conj() @ Q @ x) ** 2 / np.vecdot(a, a @ Q.T).real)

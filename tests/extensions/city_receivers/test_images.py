@@ -9,10 +9,9 @@ import pytest
 
 from isac_rt.extensions.city_receivers.images import (
     Images,
+    Ways,
     _by_one,
     _by_two,
-    own_images,
-    sender_images,
 )
 from isac_rt.extensions.city_receivers.walls import Walls, lengths
 from isac_rt.frame.antennas import Antennas
@@ -48,6 +47,14 @@ def pose(place: list[float], forward: list[float]) -> Pose:
 WALL = [[11.3, -20.0, -6.0], [11.3, 40.0, -6.0], [11.3, 40.0, 13.0], [11.3, -20.0, 13.0]]
 GROUND = [[-30.0, -20.0, -6.0], [11.3, -20.0, -6.0], [11.3, 40.0, -6.0], [-30.0, 40.0, -6.0]]
 OWN = pose([1.7, -3.1, 4.2], [1.0, 0.0, 0.0])
+
+
+def own_images(own: Pose, walls: Walls, reach: float) -> np.ndarray:
+    return Ways.of_own(own, walls, reach).seen[:, :2]
+
+
+def sender_images(sender: np.ndarray, own: Pose, walls: Walls, reach: float) -> np.ndarray:
+    return Ways.of_sender(sender, own, walls, reach).seen
 
 
 def unique(found: np.ndarray) -> np.ndarray:
@@ -161,7 +168,7 @@ def test_all_ways_over_one_and_two_planes_are_found():
             expected.append([far[0], (far[2] - far[1]) / 2e-4])
     found = np.concatenate(
         [
-            lengths(one(sender, here, walls, near_ends, 500.0), here)
+            lengths(one(sender, here, walls, near_ends, 500.0)[0], here)
             for one, near_ends in ((_by_one, near), (_by_two, (near, near)))
         ]
     )
