@@ -17,6 +17,7 @@ from isac_rt.extensions.city_receivers.angle_doppler import (
 )
 from isac_rt.extensions.city_receivers.covariance import Bucketed
 from isac_rt.extensions.city_receivers.power import Taper, expected_power
+from isac_rt.extensions.city_receivers.waves import waves_of
 from isac_rt.frame.antennas import Antennas, antennas_of, resolutions
 from isac_rt.frame.payload import unmodulated
 from isac_rt.frame.schedule import conventional_schedule
@@ -476,6 +477,20 @@ def test_a_strong_wave_is_one():
     settings = Receivers(clutter_detector="angle_doppler")
     d = AngleDoppler(settings).sense(spectra, sent, no_clutter()).detections
     assert (np.abs(d.range - path.length / 2) < 2 * w.range_cell(2)).sum() == 1
+
+
+@pytest.mark.parametrize("clutter", [0.0, 1e4])
+def test_an_axis_whose_channels_hold_clutter_is_not_told(clutter):
+    """One wave on an L whose upright arm may be covered by clutter: what is left of it, a row, has
+    the same likelihood at all elevations. Planted bug: the likelihood of white noise."""
+    w = Waveform()
+    search = channel_search(ANTENNAS, 2 * np.pi / w.wavelength)
+    x = 9 * search.steering(np.array([0.2, 0.1]))
+    z = search.channels.positions[:, 2]
+    upright = z > z.min() + 1e-6
+    inverse = np.diag(1 / (1 + clutter * upright)).astype(np.complex64)
+    (wave,) = waves_of(x, inverse, np.array([0.2, 0.1]), search, 20.0)
+    assert wave.told.tolist() == [True, clutter == 0]
 
 
 def test_waves_of_an_echo_over_a_wall_start_no_track():

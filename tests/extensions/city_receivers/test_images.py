@@ -110,6 +110,21 @@ def test_what_is_not_there_shows_nothing():
     assert not len(own_images(OWN, city(WALL), 9.0))
 
 
+def test_the_corner_of_a_house_sends_nothing_back():
+    """Its walls end at the edge that the terminal looks at, and go on behind each other; a third of
+    a metre between walls that meet in front hides no corner. Planted bugs: any edge a corner;
+    normals as the mesh has them."""
+
+    def upright(x0: float, y0: float, x1: float, y1: float) -> list[list[float]]:
+        return [[x0, y0, -6.0], [x1, y1, -6.0], [x1, y1, 13.0], [x0, y0, 13.0]]
+
+    house = city(upright(11.3, 2.0, 11.3, 40.0), upright(11.3, 2.0, 40.0, 2.0))
+    assert not len(own_images(OWN, house, 100.0))
+    yard = city(upright(11.3, -20.0, 11.3, 2.0), upright(-18.0, 2.0, 11.1, 2.0))
+    expected = np.sort([9.6, 5.1, np.hypot(9.6, 5.1)])
+    np.testing.assert_allclose(unique(own_images(OWN, yard, 100.0))[:, 0], expected, atol=1e-8)
+
+
 def within_a_face(walls: Walls, mirror: int, point: np.ndarray) -> bool:
     """Whether a place in a mirror's plane is off a face's sides by 0.3 m at most, by barycentric
     coordinates and the altitudes that they are shares of."""
@@ -220,6 +235,19 @@ def test_images_and_aliases_start_no_track():
         Ownship(OWN, 0.0),
     )
     assert found.starts.tolist() == [False, False, True, True, False]
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_images_that_nothing_shows_start_tracks(hidden):
+    """The ground's image is straight below, where elements neither send nor receive; that of the
+    wall may be hidden by a screen too small to be a mirror. Planted bugs: occlusion not asked; the
+    elements' pattern not asked."""
+    screen = [[6.0, -4.0, 3.0], [6.0, -2.0, 3.0], [6.0, -2.0, 6.0], [6.0, -4.0, 6.0]]
+    walls = city(WALL, GROUND, *([screen] if hidden else []))
+    found = Images(walls, replace(ANTENNAS, gain=10**0.5, pattern="cosine"), W, 2).candidates(
+        detections([9.6, 10.2], [-0.6, -0.2], [0.2, 0.2]), Ownship(OWN, 0.0)
+    )
+    assert found.starts.tolist() == [hidden, True]
 
 
 def test_images_of_the_transmitter_start_no_track_where_they_stand():
