@@ -92,7 +92,7 @@ def waves_of(
     """
     u, alone = first[None], float(_statistic(x, inverse, first, search))
     least = alone * max(1 / ratio, RESIDUAL_SHARE)
-    while len(u) < MOST_WAVES:
+    while len(u) < min(MOST_WAVES, x.size):
         peak, further = _further(x, inverse, u, search)
         if peak < least:
             break

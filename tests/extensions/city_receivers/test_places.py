@@ -16,7 +16,7 @@ from reproduce.flights import misread
 PLACES = yaml.safe_load(Path(__file__).with_name("places.yaml").read_text(encoding="utf-8"))
 ASKED = {
     "fold": ("AT", {"U1": 12}),
-    "crowd_hover": ("AT", dict.fromkeys(("U1", "U3", "U4", "U5"), 11)),
+    "crowd_hover": ("AT", dict.fromkeys(("U1", "U2", "U3", "U4", "U5"), 11) | {"false": 0.1}),
     "crowd_cross": ("AT", {"tracked": 48, "gospa_m": 2.68}),
     "mirror_as_sight": ("PT1", {"tracked": 63, "gospa_m": 3.7, "false": 0.3}),
     "path_tracks_one_way": ("PT1", {"tracked": 63, "false": 0.1}),
@@ -27,9 +27,8 @@ ASKED = {
     "abreast": ("AT", {"found": 70, "tracked": 61}),
 }
 """Target-frames found and tracked, also by UAV, and data frames read: at least; GOSPA and false
-tracks a frame: at most. Three values are short of what a place allows: U2 of the hovering crowd is
-seen in the direction of a sidelobe, the mirror's GOSPA could be 3.4 m with 0.15 false, and the
-column's last UAV is too weak in two thirds of the frames (0.92 is asked)."""
+tracks a frame: at most. Two values are short of what was asked for: GOSPA behind the mirror 3.4 m
+with 0.15 false, and 0.92 tracked of the column, whose last UAV is too weak in most frames."""
 MOST = "gospa_m", "false"
 
 
