@@ -79,7 +79,7 @@ class AngleDoppler:
                 towards = wave.cosines
                 if not self.estimator.on_grid:
                     towards = near_beam(estimate, known, towards, inverse)
-                direction.append(np.where(wave.told, towards, np.nan))
+                direction.append(towards)
                 told.append(wave.told)
                 cells.append(cell)
                 waves.append((wave.share, wave.number))
@@ -88,9 +88,9 @@ class AngleDoppler:
         snr = share * np.maximum(power[rows, bins] / level[rows, bins], ratio[rows, bins])
         detections = describe(found, snr, known, on_grid=self.estimator.on_grid, mixed=TWO_WAVES)
         towards, limit = np.array(direction).reshape(-1, 2), known.antennas.view_limit
-        towards = np.where(np.abs(towards) <= limit, towards, np.nan)
-        std = detections.std.copy()
-        std[:, 2:][~np.array(told, bool).reshape(-1, 2)] = np.inf
+        axes, std = np.array(told, bool).reshape(-1, 2), detections.std.copy()
+        towards = np.where(axes & (np.abs(towards) <= limit), towards, np.nan)
+        std[:, 2:][~axes] = np.inf
         sure = ratio[rows, bins] * (test.limits[0] / test.limits[1])
         # where there is no clutter a UAV's echo is one wave
         starts = (share * sure > 1) & (detections.starts | test.filled[rows, bins])

@@ -200,13 +200,13 @@ def suspicion(
         )
     sources = [(tracks, int(s)) for s in np.flatnonzero(tracks.confirmed & (out.behind < 0))]
     if reported is not None:
-        new = (reported.std < leeway.resolution).all(axis=1) & ~reported.is_reference
+        sure = (reported.std < leeway.resolution).all(axis=1) & ~reported.is_reference
         if sender is None:  # an own track tells how strong echoes may be; nothing masks it
             seen = tracks.select(tracks.confirmed)
             off = reported.measured[:, None] - seen.measured
             std = np.hypot(reported.std[:, None], seen.std)
-            new &= ~leeway.explained(off, std).any(axis=1)
-        sources += [(reported, int(s)) for s in np.flatnonzero(new)]
+            sure &= ~leeway.explained(off, std).any(axis=1)
+        sources += [(reported, int(s)) for s in np.flatnonzero(sure)]
     reach = 2 * float(np.max(tracks.range, initial=0.0)) + 1
     for known, s in sources:
         if sender is None:
@@ -310,7 +310,7 @@ def _images(
 ) -> list[tuple[int, np.ndarray]]:
     """Mirror images (6,) of a UAV (6,) in the walls that show it to an end (6,) within reach [m],
     world coordinates, with the walls' faces."""
-    mirrors, images = walls.images(target, end, reach, MEETING)
+    mirrors, images, _ = walls.images(target, end, reach, MEETING)
     return [(int(walls.mirrors[0][k]), image) for k, image in zip(mirrors, images, strict=True)]
 
 

@@ -65,11 +65,9 @@ class Images(TrackRule):
         too, or in an alias of it."""
         reach, here = float(d.range.max()) + 1, own.pose
         if self._passes == 2:
-            start = np.concatenate([here.position, here.velocity])
             known = Ways.of_own(here, self._walls, reach)
         elif own.transmitter is not None:
-            start = own.transmitter.mean[:6]
-            known = Ways.of_sender(start, here, self._walls, reach)
+            known = Ways.of_sender(own.transmitter.mean[:6], here, self._walls, reach)
         else:
             return np.zeros(len(d), bool)
         off = np.abs(wrapped(d.measured[:, None, :2] - known.seen[:, :2], self._ambiguity))
@@ -79,8 +77,7 @@ class Images(TrackRule):
             beside &= (away < self._beam + ALIAS_DEVIATIONS * d.std[:, None, 2:]).all(axis=-1)
         gain = self._antennas.element_gain(here.to_body(known.images[:, :3] - here.position))
         for k in np.flatnonzero(beside.any(axis=0)):
-            points = np.array([start[:3], *known.points[k], here.position])
-            beside[:, k] &= gain[k] > 0 and not self._walls.block(points)
+            beside[:, k] &= gain[k] > 0 and not self._walls.block(known.points[k])
         return np.asarray(beside.any(axis=1))
 
 
@@ -90,7 +87,7 @@ class Ways(NamedTuple):
     Attributes
     ----------
     images : (K, 6) from where waves seem to come, world coordinates
-    points : (K, 2, 3) where they meet planes; the same twice where it is one
+    points : (K, 4, 3) their ends and between them where they meet planes, the same twice for one
     seen : (K, 4) length [m], its rate [m/s] and direction cosines; of own images half of both, as
         of echoes
     """
@@ -125,24 +122,19 @@ def _images(
     reach: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Images (K, 6) of `start` (6,) that `end` (6,) sees, over mirrors that are near the one and
-    the other, and where their waves meet the mirrors (K, 2, 3)."""
+    the other, and the ways of their waves (K, 4, 3)."""
     parts = _by_one(start, end, walls, near[1], reach), _by_two(start, end, walls, near, reach)
-    images, points = zip(*parts, strict=True)
-    return np.concatenate(images), np.concatenate(points)
+    images, points = (np.concatenate(of) for of in zip(*parts, strict=True))
+    first, last = (np.tile(of[:3], (len(images), 1, 1)) for of in (start, end))
+    return images, np.concatenate([first, points, last], axis=1)
 
 
 def _by_one(
     start: np.ndarray, end: np.ndarray, walls: Walls, near: np.ndarray, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    which, images = walls.images(start, end, reach, EDGE, near)
+    _, images, places = walls.images(start, end, reach, EDGE, near)
     far = np.linalg.norm(images[:, :3] - end[:3], axis=1) > 2 * LEAST_RANGE
-    which, images = which[far], images[far]
-    _, normals, offsets = walls.mirrors
-    before = normals[which] @ end[:3] - offsets[which]
-    span = images[:, :3] - end[:3]
-    share = -before / np.vecdot(normals[which], span)
-    met_at = end[:3] + share[:, None] * span
-    return images, np.stack([met_at, met_at], axis=1)
+    return images[far], np.stack([places, places], axis=1)[far]
 
 
 def _by_two(

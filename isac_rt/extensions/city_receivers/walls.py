@@ -108,9 +108,10 @@ class Walls:
         reach: float,
         edge: float,
         among: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mirrors (K,) that show a UAV (6,) to an `end` (6,) within `reach` [m], and
-        its images in them (K, 6), positions and velocities in world coordinates.
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the mirrors (K,) that show a UAV (6,) to an `end` (6,) within `reach` [m], its
+        images in them (K, 6), positions and velocities in world coordinates, and where the waves
+        meet them (K, 3).
 
         Parameters
         ----------
@@ -130,7 +131,8 @@ class Walls:
         low, high = self.boxes[:, tried]
         boxed = ((met >= low - edge) & (met <= high + edge)).all(axis=1)
         shown = np.flatnonzero(boxed)[self.holds(tried[boxed], met[boxed], edge)]
-        return tried[shown], np.hstack([places, mirror_image(target[3:6], n)])[shown]
+        images = np.hstack([places, mirror_image(target[3:6], n)])
+        return tried[shown], images[shown], met[shown]
 
     def holds(self, mirrors: np.ndarray, points: np.ndarray, edge: float) -> np.ndarray:
         """Return whether points (n, 3) in the planes of mirrors (n,) lie on one of their faces, or

@@ -136,8 +136,9 @@ def _deviations(x: np.ndarray, Q: np.ndarray, cosines: np.ndarray, search: Searc
         u = np.tile(cosines, (values.size, 1))
         u[:, axis] = values
         T = np.where((u**2).sum(axis=1) <= 1, _statistic(x, Q, u, search), 0.0)
-        weight = np.exp(T - T.max()) / np.exp(T - T.max()).sum()
-        out[axis] = np.sqrt(weight @ (values - weight @ values) ** 2)
+        weight = np.exp(T - T.max())
+        mean = np.average(values, weights=weight)
+        out[axis] = np.sqrt(np.average((values - mean) ** 2, weights=weight))
     return out
 
 

@@ -493,6 +493,15 @@ def test_an_axis_whose_channels_hold_clutter_is_not_told(clutter):
     assert wave.told.tolist() == [True, clutter == 0]
 
 
+def test_a_single_channel_holds_one_wave():
+    """The bug that was there: a second wave sought in what one leaves of a single channel, whose
+    statistic is 0 over 0."""
+    search = channel_search(replace(ANTENNAS, tx_x=1, tx_z=1, rx_x=1, rx_z=1), 1600.0)
+    one = np.ones((1, 1), np.complex64)
+    (wave,) = waves_of(9 * one[0], one, np.zeros(2), search, 20.0)
+    assert wave.share == pytest.approx(1) and wave.told.all()
+
+
 def test_waves_of_an_echo_over_a_wall_start_no_track():
     """A UAV at 20 m, a pair of waves in one cell at 25 m of which one comes from there, a pair from
     elsewhere, and one wave alone behind the UAV. Planted bugs: one of the pair spared; a wave alone
