@@ -46,7 +46,7 @@ def first_passage(city: CityMesh, polyline: np.ndarray) -> Passage | None:
     return _first(city, np.arange(city.num_faces), polyline, 0)
 
 
-def _beside(city: CityMesh, polyline: np.ndarray, faces: np.ndarray | slice) -> np.ndarray:
+def beside(city: CityMesh, polyline: np.ndarray, faces: np.ndarray | slice) -> np.ndarray:
     """(N,) which of some faces have boxes that meet that of a way (T, 3)."""
     low, high = city.boxes
     inside = (low[faces] <= polyline.max(axis=0)) & (high[faces] >= polyline.min(axis=0))
@@ -55,7 +55,7 @@ def _beside(city: CityMesh, polyline: np.ndarray, faces: np.ndarray | slice) -> 
 
 def _first(city: CityMesh, faces: np.ndarray, polyline: np.ndarray, begin: int) -> Passage | None:
     """By halves: only faces whose boxes meet that of a part of the way are looked at again."""
-    faces = faces[_beside(city, polyline, faces)]
+    faces = faces[beside(city, polyline, faces)]
     if not faces.size or len(polyline) < 2:
         return None
     if len(polyline) == 2:
@@ -142,7 +142,7 @@ def enclosed(city: CityMesh, position: np.ndarray) -> bool:
         level = np.cos(elevation)
         towards = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
         end = position + reach * np.array(towards)
-        near = city.corners[_beside(city, np.stack([position, end]), slice(None))]
+        near = city.corners[beside(city, np.stack([position, end]), slice(None))]
         return len(hits(near, position, end)[0])
 
     # no direction is along an edge of what people build: an edge would count twice

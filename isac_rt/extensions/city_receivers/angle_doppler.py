@@ -89,8 +89,9 @@ class AngleDoppler:
         detections = describe(found, snr, known, on_grid=self.estimator.on_grid, mixed=TWO_WAVES)
         towards, limit = np.array(direction).reshape(-1, 2), known.antennas.view_limit
         axes, std = np.array(told, bool).reshape(-1, 2), detections.std.copy()
-        towards = np.where(axes & (np.abs(towards) <= limit), towards, np.nan)
-        std[:, 2:][~axes] = np.inf
+        in_view = np.abs(towards) <= limit
+        std[:, 2:][in_view & ~axes] = np.inf
+        towards = np.where(in_view & axes, towards, np.nan)
         sure = ratio[rows, bins] * (test.limits[0] / test.limits[1])
         # where there is no clutter a UAV's echo is one wave
         starts = (share * sure > 1) & (detections.starts | test.filled[rows, bins])

@@ -30,6 +30,9 @@ WELL_INSIDE = 0.95
 """Share of the view's largest cosines within which a direction is no alias of one outside."""
 ALIAS_DEVIATIONS = 3.0
 """So many deviations further inside at a passive terminal, whose array is half as long."""
+CORNER_STEPS_M = 0.02, EDGE, 2 * EDGE
+"""From the edge of a corner on each plane [m]: a roof's wall may end a hand above it, and planes
+need not meet."""
 
 
 class Images(TrackRule):
@@ -75,7 +78,7 @@ class Images(TrackRule):
         if self._passes == 1:
             away = np.abs(folded(d.direction[:, None] - known.seen[:, 2:], self._cosine_period))
             beside &= (away < self._beam + ALIAS_DEVIATIONS * d.std[:, None, 2:]).all(axis=-1)
-        gain = self._antennas.element_gain(here.to_body(known.images[:, :3] - here.position))
+        gain = self._antennas.element_gain(here.to_body(_unit(known.images[:, :3] - here.position)))
         for k in np.flatnonzero(beside.any(axis=0)):
             beside[:, k] &= gain[k] > 0 and not self._walls.block(known.points[k])
         return np.asarray(beside.any(axis=1))
@@ -159,9 +162,10 @@ def _by_two(
         for k, end_of in ((i, start), (j, end))
     )
     sends = np.linalg.norm(A - B, axis=1) > EDGE
+    along = np.vecdot(n, m)[:, None]
     goes_on = [
-        walls.holds(k, place + 2 * EDGE * _unit(other - np.vecdot(n, m)[:, None] * own), 0.0)
-        for k, place, own, other in ((i, A, n, m), (j, B, m, n))
+        np.any([walls.holds(k, place + step * ahead, 0.0) for step in CORNER_STEPS_M], axis=0)
+        for k, place, ahead in ((i, A, _unit(m - along * n)), (j, B, _unit(n - along * m)))
     ]
     sends |= goes_on[0] & goes_on[1]
     turned = mirror_image(mirror_image(start[3:], n), m)

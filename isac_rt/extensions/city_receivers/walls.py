@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.mirrors import mirror_image
-from isac_rt.world.passage import hits
+from isac_rt.world.passage import beside, hits
 from isac_rt.world.swarm import Pose
 
 SMALLEST_WALL = 8.0
@@ -151,19 +150,15 @@ class Walls:
     def blocking(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Faces (n,) that the open segment between two points (3,) crosses."""
         ends = np.array([start, end]) - self.city.origin
-        low, high = self.city.boxes
-        beside = (low <= ends.max(axis=0)) & (high >= ends.min(axis=0))
-        near = np.flatnonzero(beside.all(axis=1))
+        near = np.flatnonzero(beside(self.city, ends, slice(None)))
         faces, share = hits(self.city.corners[near], *ends)
         return near[faces[(share > 0) & (share < 1)]]
 
     def block(self, polyline: np.ndarray) -> bool:
         """Return whether a face crosses a segment of a polyline (P, 3), but for its ends."""
-        for start, end in pairwise(polyline):
-            inset = AT_WALL * (end - start)
-            if self.blocking(start + inset, end - inset).size:
-                return True
-        return False
+        inset = AT_WALL * np.diff(polyline, axis=0)
+        legs = np.stack([polyline[:-1] + inset, polyline[1:] - inset], axis=1)
+        return any(self.blocking(*leg).size for leg in legs[inset.any(axis=1)])
 
 
 def lengths(targets: np.ndarray, end: np.ndarray) -> np.ndarray:

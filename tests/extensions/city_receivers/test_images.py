@@ -112,8 +112,9 @@ def test_what_is_not_there_shows_nothing():
 
 def test_the_corner_of_a_house_sends_nothing_back():
     """Its walls end at the edge that the terminal looks at, and go on behind each other; a third of
-    a metre between walls that meet in front hides no corner. Planted bugs: any edge a corner;
-    normals as the mesh has them."""
+    a metre between walls that meet in front hides no corner, nor does a wall that ends a hand above
+    its roof. Planted bugs: any edge a corner; normals as the mesh has them; planes that have to go
+    on for 0.6 m."""
 
     def upright(x0: float, y0: float, x1: float, y1: float) -> list[list[float]]:
         return [[x0, y0, -6.0], [x1, y1, -6.0], [x1, y1, 13.0], [x0, y0, 13.0]]
@@ -123,6 +124,11 @@ def test_the_corner_of_a_house_sends_nothing_back():
     yard = city(upright(11.3, -20.0, 11.3, 2.0), upright(-18.0, 2.0, 11.1, 2.0))
     expected = np.sort([9.6, 5.1, np.hypot(9.6, 5.1)])
     np.testing.assert_allclose(unique(own_images(OWN, yard, 100.0))[:, 0], expected, atol=1e-8)
+    parapet = [[11.3, -20.0, -6.0], [11.3, 20.0, -6.0], [11.3, 20.0, 2.2], [11.3, -20.0, 2.2]]
+    roof = [[-20.0, -20.0, 2.0], [11.3, -20.0, 2.0], [11.3, 20.0, 2.0], [-20.0, 20.0, 2.0]]
+    expected = [2.2, np.hypot(9.6, 2.2)]
+    terrace = unique(own_images(OWN, city(parapet, roof), 100.0))[:, 0]
+    np.testing.assert_allclose(terrace, expected, atol=1e-8)
 
 
 def within_a_face(walls: Walls, mirror: int, point: np.ndarray) -> bool:
