@@ -180,7 +180,12 @@ class Antennas:
     def observes(self, passes: int) -> tuple[bool, bool]:
         """Return whether directions along X and along Z are observable: the channels of an echo
         (passes = 2), or the receive elements for one pass, span that axis."""
-        return _observes(self, passes)
+        return self.places(passes)[0] > 1, self.places(passes)[1] > 1
+
+    def places(self, passes: int) -> tuple[int, int]:
+        """Numbers of different places along X and along Z of the channels of an echo (passes = 2),
+        or of the receive elements."""
+        return _places(self, passes)
 
     @property
     def view_limit(self) -> float:
@@ -255,10 +260,10 @@ class Arrays:
 
 
 @lru_cache(maxsize=64)
-def _observes(antennas: Antennas, passes: int) -> tuple[bool, bool]:
+def _places(antennas: Antennas, passes: int) -> tuple[int, int]:
     positions = antennas.virtual_positions if passes == 2 else antennas.rx_positions
-    span = np.ptp(positions, axis=0)
-    return bool(span[0] > SAME_POSITION_M), bool(span[2] > SAME_POSITION_M)
+    steps = np.diff(np.sort(positions, axis=0), axis=0) > SAME_POSITION_M
+    return 1 + int(steps[:, 0].sum()), 1 + int(steps[:, 2].sum())
 
 
 @lru_cache(maxsize=64)

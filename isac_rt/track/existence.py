@@ -8,11 +8,11 @@ grows by
 .. math:: \ln\frac{p_D}{p_A} \text{ if the frame shows it}, \qquad
     \ln\frac{1 - p_D}{1 - p_A} \text{ if not},
 
-and by :math:`\ln(p_D p_C)` where the frame shows what a known artefact must show, as a target's
-echo over a wall, and a target is there by chance with the probability :math:`p_C`. This is the
-recursion of Musicki, Evans and Stankovic [1]_ with artefacts in place of uniform clutter. The
-track's own record of n detections in N frames says :math:`p_D = (n + 1) / (N + 2)` (Laplace's rule
-of succession).
+and by :math:`\ln(p_A p_C)` more where the frame shows what a known artefact must show, as a
+target's echo over a wall: :math:`p_C` is the density of targets there over that of the artefact's
+measures, at most 1. This is the recursion of Musicki, Evans and Stankovic [1]_ with artefacts in
+place of uniform clutter. The track's own record of n detections in N frames says
+:math:`p_D = (n + 1) / (N + 2)` (Laplace's rule of succession).
 
 References
 ----------
@@ -28,11 +28,10 @@ BIRTH = log(1 / 6)
 """Log-odds of a first detection: of ten that no rule refuses, one or two are of a new target."""
 RECURS = 0.1
 """p_A: share of the frames in which an artefact is found where its track expects it."""
-EXPLAINED = log(RECURS * 0.2)
-"""What a detection says less if a known artefact explains it: p_A p_C, with one frame in five in
-which a target is there by chance."""
 SURE = log(200)
 """Most that a record says: a target may leave or hide."""
+LEAST_CHANCE = 0.2
+"""p_C at the least: a mesh, or a track that is taken for a source, may be wrong."""
 
 
 def updated(
@@ -43,3 +42,8 @@ def updated(
     found = most * (hits + 1) / (frames + 2)
     said = log(found / recurs) if hit else log((1 - found) / (1 - recurs))
     return min(odds + said, SURE)
+
+
+def explained(chance: float) -> float:
+    """Return what a detection says less if a known artefact explains it, with the `chance` p_C."""
+    return log(RECURS * max(chance, LEAST_CHANCE))

@@ -266,11 +266,12 @@ class Tracker(Stateful):
         """End some tracks."""
         self.state.tracks = [t for t in self.tracks if t.id not in ids]
 
-    def doubt(self, ids: Container[int]) -> None:
-        """Take it that an artefact explains the detections of some tracks in this frame."""
+    def doubt(self, chances: Mapping[int, float]) -> None:
+        """Take it that an artefact explains this frame's detections of tracks, {id: chance that a
+        target is there all the same}; from 1 on it says nothing."""
         for track in self.tracks:
-            if track.id in ids and track.detection >= 0:
-                track.odds += existence.EXPLAINED
+            if track.detection >= 0 and chances.get(track.id, 1.0) < 1:
+                track.odds += existence.explained(chances[track.id])
 
     def predict(self, time: float) -> None:
         """Bring all tracks to `time` [s]."""
@@ -421,7 +422,7 @@ class Tracker(Stateful):
         if self.by_odds:
             sure = track.sure >= min(SURE_HITS, s.confirm_hits)
             enough = sure and (enough or active)
-        track.confirmed = track.confirmed or enough
+        track.confirmed = track.confirmed or (hit and enough)
 
     def _dead(self, track: Track) -> bool:
         """A confirmed track ends after `drop_misses` misses in a row, or `drop_after_s` without a

@@ -18,6 +18,7 @@ terminal, as it tracks it; and whether one is that terminal itself over a wall.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -25,9 +26,10 @@ from isac_rt.extensions.city_receivers.walls import Walls, lengths
 from isac_rt.frame.antennas import Antennas, folded, resolutions
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
-from isac_rt.track.filter import Ambiguity, measure, wrapped
+from isac_rt.track.filter import Ambiguity, Gaussian, measure, reported, wrapped
 from isac_rt.track.parts import Ownship, TrackRule
 from isac_rt.track.tracker import Track, Tracker, TrackSet, track_set
+from isac_rt.world.mirrors import mirror_image
 from isac_rt.world.swarm import Pose
 
 DEVIATIONS = 3.0
@@ -37,6 +39,8 @@ MEETING = 1e-9
 RESOLUTION_SHARE = 0.5
 """Share of the resolution that it may be off besides: echoes that share a cell pull each other's
 estimates."""
+AVERAGED = 9
+"""Most frames over which a track averages the pull on its range and its rate."""
 ONE_WAY_SHARE = 2.0
 """The same for the direction of an echo over a wall on one way at an active terminal: its transmit
 antennas see another direction than its receive antennas, so that the halves of the virtual array do
@@ -47,6 +51,9 @@ back."""
 ALIKE = 4.0
 """Factor in power within which the waves of such an echo are found, and over the noise from which
 on both are."""
+APART = np.array([3.0, 1.0, 0.1, 0.1])
+"""Deviations of a target's range [m], rate [m/s] and direction cosines from another's: swarms fly
+in formations."""
 CROSSING_M = 3.0
 """Tracks that were reported before are held against the walls so near to them [m]: one that lay
 before all walls comes by here on its way behind one."""
@@ -89,7 +96,7 @@ class Ghosts(TrackRule):
         )
         rows = np.isin(tracks.ids, [*asked]) & ~tracks.is_reference
         said = suspicion(tracks, own.pose, self._walls, self._leeway, others, rows, single)
-        tracker.doubt(set(tracks.ids[said.suspect].tolist()))
+        tracker.doubt(dict(zip(tracks.ids.tolist(), said.chance.tolist(), strict=True)))
 
 
 @dataclass(frozen=True)
@@ -102,32 +109,48 @@ class Leeway:
         pass at a passive terminal
     ambiguity : of range and velocity
     cosine_period : of `Antennas`: an image may stand beyond the view
+    tells : (2,) bool, axes along which the array has three places or more: with two, two waves are
+        one from between them
     """
 
     resolution: np.ndarray
     ambiguity: Ambiguity
     cosine_period: np.ndarray | float = np.inf
+    tells: tuple[bool, bool] = (True, True)
 
     @classmethod
     def of(cls, waveform: Waveform, antennas: Antennas, passes: int) -> Leeway:
         """At an active terminal (2 passes) or a passive one (1)."""
         cells = resolutions(waveform, antennas, passes)
         cosine_period = antennas.cosine_period(waveform.wavelength, passes)
-        return cls(cells, Ambiguity.of(waveform, passes), cosine_period)
+        across, up = antennas.places(passes)
+        return cls(cells, Ambiguity.of(waveform, passes), cosine_period, (across > 2, up > 2))
 
-    def explained(
-        self, off: np.ndarray, std: np.ndarray, one_way: bool | np.ndarray = False
-    ) -> np.ndarray:
-        """Return whether differences (..., 4) of paths' measures are insignificant, by their
-        deviations and whether they are of an active terminal's echo over a wall on `one_way` (...).
-        """
-        off = wrapped(off, self.ambiguity)
+    def off(self, difference: np.ndarray) -> np.ndarray:
+        """Return differences (..., 4) of paths' measures, the least that ambiguities leave."""
+        off = wrapped(difference, self.ambiguity)
         off[..., 2:] = folded(off[..., 2:], self.cosine_period)
+        return off
+
+    def pull(self, one_way: bool | np.ndarray = False, age: int | np.ndarray = 0) -> np.ndarray:
+        """Return by how much (..., 4) other echoes may change what a track of an `age` [frames]
+        measures, and whether of an active terminal's echo over a wall on `one_way`."""
         share = np.where(np.asarray(one_way)[..., None], ONE_WAY_SHARE, RESOLUTION_SHARE)
         share = np.where([False, False, True, True], share, RESOLUTION_SHARE)
-        allowed = DEVIATIONS * std + share * self.resolution
-        hit: np.ndarray = (np.abs(off) <= allowed).all(axis=-1)
-        return hit
+        looks = np.minimum(np.asarray(age)[..., None] + 1, AVERAGED)
+        share = share / np.where([True, True, False, False], np.sqrt(looks), 1.0)
+        return np.asarray(share * self.resolution)
+
+    def explained(self, off: np.ndarray, std: np.ndarray, pull: np.ndarray) -> np.ndarray:
+        """Return whether differences `off` (..., 4) are insignificant, by deviations and pulls."""
+        return np.asarray((np.abs(off) <= DEVIATIONS * std + pull).all(axis=-1))
+
+    def apart(self, paths: np.ndarray) -> np.ndarray:
+        """(P,) whether the array tells the two waves of an echo over a wall on one way apart, of
+        `echoes` (P, 4)."""
+        direct, mirrored = paths[0::4, 2:], paths[3::4, 2:]
+        off = np.abs(mirrored - direct) > self.resolution[2:]
+        return np.repeat((off & self.tells).any(axis=1), 4)
 
 
 @dataclass(frozen=True)
@@ -143,12 +166,15 @@ class Suspicion:
         passive terminal the second wall may be another; `mirrored` is the first
     behind : (K,) int32 face that hides the place of the track from the terminal or, at a passive
         one, from its transmitter, -1: it is in sight
+    chance : (K,) odds against these of a target that is there all the same; inf: nothing speaks
+        against it
     """
 
     mirrored: np.ndarray
     source: np.ndarray
     order: np.ndarray
     behind: np.ndarray
+    chance: np.ndarray
 
     @property
     def suspect(self) -> np.ndarray:
@@ -186,57 +212,140 @@ def suspicion(
         np.full(count, -1),
         np.zeros(count, np.int8),
         np.full(count, -1, np.int32),
+        np.full(count, np.inf),
     )
-    measured = tracks.measured
-    sender = tracks.mean[tracks.is_reference][0] if tracks.is_reference.any() else None
-    seen_from = [own.position] if sender is None else [own.position, own.position + sender[:3]]
+    held = _Held(tracks, own, walls, leeway)
     for k in np.flatnonzero(~tracks.is_reference if asked is None else asked):
         out.behind[k] = occluded_by(
             own.position + tracks.mean[k, :3],
             tracks.covariance[k, :3, :3],
-            seen_from,
+            held.seen_from,
             walls,
             leeway.resolution[0],
         )
     sources = [(tracks, int(s)) for s in np.flatnonzero(tracks.confirmed & (out.behind < 0))]
     if reported is not None:
-        sure = (reported.std < leeway.resolution).all(axis=1) & ~reported.is_reference
-        if sender is None:  # an own track tells how strong echoes may be; nothing masks it
-            seen = tracks.select(tracks.confirmed)
-            off = reported.measured[:, None] - seen.measured
-            std = np.hypot(reported.std[:, None], seen.std)
-            sure &= ~leeway.explained(off, std).any(axis=1)
-        sources += [(reported, int(s)) for s in np.flatnonzero(sure)]
-    reach = 2 * float(np.max(tracks.range, initial=0.0)) + 1
+        sources += [(reported, int(s)) for s in np.flatnonzero(held.useful(reported))]
     for known, s in sources:
-        if sender is None:
-            shown = echoes(known.mean[s], own, walls, reach)
-        else:
-            start = None if known.is_reference[s] else sender
-            shown = reflections(known.mean[s], start, own, walls, reach)
+        shown = held.shown(known, s)
         if not shown:
             continue
+        faces, orders, paths = (np.array(of) for of in zip(*shown, strict=True))
+        chance = held.chances(known, s, faces, orders, paths, single)
+        which, least = chance.argmin(axis=1), chance.min(axis=1)
+        new = least < out.chance
+        out.mirrored[new], out.order[new] = faces[which[new]], orders[which[new]]
+        out.source[new], out.chance[new] = known.ids[s], least[new]
+    out.chance[out.behind >= 0] = 0.0
+    return out
+
+
+@dataclass(frozen=True)
+class _Held:
+    """Tracks that are held against a mesh."""
+
+    tracks: TrackSet
+    own: Pose
+    walls: Walls
+    leeway: Leeway
+
+    @cached_property
+    def sender(self) -> np.ndarray | None:
+        """(6,) of a passive terminal's transmitter, relative to the terminal."""
+        is_reference = self.tracks.is_reference
+        return self.tracks.mean[is_reference][0] if is_reference.any() else None
+
+    @property
+    def seen_from(self) -> list[np.ndarray]:
+        """Places of both ends."""
+        here = self.own.position
+        return [here] if self.sender is None else [here, here + self.sender[:3]]
+
+    @cached_property
+    def density(self) -> np.ndarray:
+        """(K,) how many targets there are by unit of range, rate and directions where tracks are,
+        by the other reported ones."""
+        tracks = self.tracks
+        others = np.flatnonzero(tracks.confirmed & ~tracks.is_reference)
+        near = _normal(tracks.measured[:, None] - tracks.measured[others], APART)
+        near[others, np.arange(len(others))] = 0.0
+        return np.asarray(near.sum(axis=1))
+
+    def useful(self, told: TrackSet) -> np.ndarray:
+        """Return which UAVs that others report (S,) may explain tracks."""
+        sure = (told.std < self.leeway.resolution).all(axis=1) & ~told.is_reference
+        if self.sender is None:  # an own track tells how strong echoes may be; nothing masks it
+            seen = self.tracks.select(self.tracks.confirmed)
+            off = self.leeway.off(told.measured[:, None] - seen.measured)
+            std = np.hypot(told.std[:, None], seen.std)
+            sure &= ~self.leeway.explained(off, std, self.leeway.pull()).any(axis=1)
+        return np.asarray(sure)
+
+    def shown(self, known: TrackSet, s: int) -> list[tuple[int, int, np.ndarray]]:
+        """Return `echoes` or `reflections` of a source."""
+        reach = 2 * float(np.max(self.tracks.range, initial=0.0)) + 1
+        if self.sender is None:
+            return echoes(known.mean[s], self.own, self.walls, reach)
+        start = None if known.is_reference[s] else self.sender
+        return reflections(known.mean[s], start, self.own, self.walls, reach)
+
+    def chances(
+        self,
+        known: TrackSet,
+        s: int,
+        faces: np.ndarray,
+        orders: np.ndarray,
+        paths: np.ndarray,
+        single: np.ndarray | None,
+    ) -> np.ndarray:
+        """Return `Suspicion.chance` (K, P) for each path (P,) of a source; inf: no such echo."""
+        tracks, leeway = self.tracks, self.leeway
         std = np.hypot(tracks.std, known.std[s])
         may_be = ~tracks.is_reference & (tracks.range > known.range[s])
-        may_be &= tracks.snr <= ECHO_WAVES * known.snr[s] * _weaker(known, s, sender, tracks.range)
-        if known is reported:  # a track of the UAV itself is no echo of it
-            may_be &= ~leeway.explained(measured - reported.measured[s], std)
-        faces, orders, paths = (np.array(of) for of in zip(*shown, strict=True))
-        one_way = (orders == 1) & (sender is None)
-        hit = leeway.explained(measured[:, None] - paths, std[:, None], one_way) & may_be[:, None]
-        if single is not None:
-            hit &= ~(single[:, None] & one_way)
-        which, new = hit.argmax(axis=1), hit.any(axis=1) & (out.mirrored < 0)
-        out.mirrored[new], out.order[new] = faces[which[new]], orders[which[new]]
-        out.source[new] = known.ids[s]
-    return out
+        weaker = _weaker(known, s, self.sender, tracks.range)
+        may_be &= tracks.snr <= ECHO_WAVES * known.snr[s] * weaker
+        if known is not tracks:  # a track of the UAV itself is no echo of it
+            off = leeway.off(tracks.measured - known.measured[s])
+            may_be &= ~leeway.explained(off, std, leeway.pull())
+        of_source, one_way = known.std[s], np.zeros(orders.shape, bool)
+        if self.sender is None:
+            of_source = np.maximum(of_source, self.mirrored_std(known, s, faces))
+            one_way = orders == 1
+        off = leeway.off(tracks.measured[:, None] - paths)
+        std = np.hypot(tracks.std[:, None], of_source)
+        pull = leeway.pull(one_way, tracks.age[:, None])
+        hit = leeway.explained(off, std, pull) & may_be[:, None]
+        if single is not None and self.sender is None:
+            hit &= ~(single[:, None] & one_way & leeway.apart(paths))
+        std, out = np.hypot(std, pull / np.sqrt(3)), np.full(hit.shape, np.inf)
+        row, path = np.nonzero(hit)
+        out[row, path] = self.density[row] / _normal(off[row, path], std[row, path])
+        return out
+
+    def mirrored_std(self, known: TrackSet, s: int, faces: np.ndarray) -> np.ndarray:
+        """Return deviations (P, 4) of what a source shows in mirrors of such faces (P,): a height
+        that its range and its rate say little of decides what the ground shows."""
+        city, own = self.walls.city, self.own
+        n, state = city.normals[faces], known.mean[s] + [*own.position, *own.velocity]
+        offsets = city.plane_offsets[faces] + n @ city.origin
+        images = np.hstack([mirror_image(state[:3], n, offsets), mirror_image(state[3:], n)])
+        turned = np.kron(np.eye(2), np.eye(3) - 2 * n[:, :, None] * n[:, None, :])
+        covariances = turned @ known.covariance[s] @ turned
+        states = [Gaussian(*of) for of in zip(images, covariances, strict=True)]
+        return reported(states, own)[1]
+
+
+def _normal(off: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Return the density of normal differences (..., 4)."""
+    exponent = -((off / std) ** 2).sum(axis=-1) / 2
+    return np.asarray(np.exp(exponent) / (np.sqrt(2 * np.pi) * std).prod(axis=-1))
 
 
 def alone(d: Detections, leeway: Leeway) -> np.ndarray:
     """Return which detections (Q,) are too strong for an echo over a wall on one way without its
     other wave, which comes from elsewhere."""
-    off = wrapped(d.measured[:, None] - d.measured, leeway.ambiguity)
-    near = np.abs(off) < leeway.resolution
+    off = np.abs(wrapped(d.measured[:, None] - d.measured, leeway.ambiguity))
+    near = off < leeway.resolution
     other = near[..., :2].all(axis=2) & ~near[..., 2:].all(axis=2)
     other &= ALIKE * d.snr > d.snr[:, None]
     return np.asarray((d.snr > ALIKE) & ~other.any(axis=1))

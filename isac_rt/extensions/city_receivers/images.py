@@ -30,6 +30,8 @@ WELL_INSIDE = 0.95
 """Share of the view's largest cosines within which a direction is no alias of one outside."""
 ALIAS_DEVIATIONS = 3.0
 """So many deviations further inside at a passive terminal, whose array is half as long."""
+ROUNDING = 1e-9
+"""Of squared cosines between planes."""
 CORNER_STEPS_M = 0.02, EDGE, 2 * EDGE
 """From the edge of a corner on each plane [m]: a roof's wall may end a hand above it, and planes
 need not meet."""
@@ -161,13 +163,12 @@ def _by_two(
         np.sign(normals[k] @ end_of[:3] - offsets[k])[:, None] * normals[k]
         for k, end_of in ((i, start), (j, end))
     )
-    sends = np.linalg.norm(A - B, axis=1) > EDGE
-    along = np.vecdot(n, m)[:, None]
-    goes_on = [
-        np.any([walls.holds(k, place + step * ahead, 0.0) for step in CORNER_STEPS_M], axis=0)
-        for k, place, ahead in ((i, A, _unit(m - along * n)), (j, B, _unit(n - along * m)))
-    ]
-    sends |= goes_on[0] & goes_on[1]
+    sends, along = np.linalg.norm(A - B, axis=1) > EDGE, np.vecdot(n, m)[:, None]
+    at = np.flatnonzero(~sends & (along[:, 0] ** 2 < 1 - ROUNDING))  # no corner of parallel planes
+    sends[at] = True
+    for k, place, ahead in ((i, A, m - along * n), (j, B, n - along * m)):
+        steps = np.multiply.outer(CORNER_STEPS_M, _unit(ahead[at]))
+        sends[at] &= np.any([walls.holds(k[at], place[at] + s, 0.0) for s in steps], axis=0)
     turned = mirror_image(mirror_image(start[3:], n), m)
     return np.hstack([at_j, turned])[sends], np.stack([A, B], axis=1)[sends]
 

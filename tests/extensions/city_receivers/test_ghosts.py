@@ -192,6 +192,123 @@ def test_bodies_that_others_know_of_explain_echoes():
     assert not suspicion(track_set([beside], OWN), OWN, Walls(wall()), wide, sure, nobody).suspect
 
 
+GROUND = CityMesh(
+    "ground",
+    np.array([[-90.0, -90.0, 0.0], [90.0, -90.0, 0.0], [90.0, 90.0, 0.0], [-90.0, 90.0, 0.0]]),
+    np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+    np.zeros(2, np.int16),
+    (),
+    ORIGIN.copy(),
+)
+
+
+LEVEL = np.array([4.6, 24.7, 4.2, -1.3, -2.2, 0.4])
+"""A body at the terminal's height."""
+
+
+def over_the_ground(climb: float) -> Track:
+    """Track of the level body's echo over the ground on one way, if it climbs by more [m/s], in the
+    middle of both directions: path length and rate by hand."""
+    own, below = OWN.position - ORIGIN, np.array([1, 1, -1])
+    velocity = LEVEL[3:] + np.array([0.0, 0.0, climb])
+    e, rates, ranges = [], [], []
+    for place, v in (
+        (LEVEL[:3], velocity),
+        (LEVEL[:3] * below, velocity * below),
+    ):
+        ranges.append(float(np.linalg.norm(place - own)))
+        e.append((place - own) / ranges[-1])
+        rates.append(float(e[-1] @ (v - OWN.velocity)))
+    ahead = e[0] + e[1]
+    ahead /= np.linalg.norm(ahead)
+    return track(6, own + np.mean(ranges) * ahead, OWN.velocity + ahead * np.mean(rates))
+
+
+@pytest.mark.parametrize(("climb", "std", "expected"), [(0, 0.1, 1), (5, 0.1, 0), (5, 2.0, 1)])
+def test_what_the_ground_shows_is_as_uncertain_as_the_climb(climb, std, expected):
+    """An array of few rows knows a UAV's climb to metres a second, and its range rate to a
+    decimetre: the ground's rate is off by what the climb is. Planted bug: the deviation of the
+    direct echo's rate."""
+    body = track(3, LEVEL[:3], LEVEL[3:])
+    body.state.covariance[5, 5] = std**2
+    flat = np.array([0.25, 0.249, 0.25, 1.0])
+    tracks = track_set([body, over_the_ground(climb)], OWN)
+    nobody = np.zeros(2, bool)
+    leeway = Leeway(flat, Ambiguity(PERIOD))
+    found = suspicion(tracks, OWN, Walls(GROUND), leeway, asked=nobody)
+    assert found.order.tolist() == [0, expected]
+
+
+@pytest.mark.parametrize(
+    ("resolution", "tells", "expected"),
+    [(0.1, (True, True), 0), (0.1, (True, False), 1), (1.0, (True, True), 1)],
+)
+def test_one_wave_is_two_where_the_array_does_not_tell_them_apart(resolution, tells, expected):
+    """The body's echo over the ground as one detection in the cell, the directions of its two waves
+    0.3 apart in height. Planted bugs: one detection excuses any track; `tells` left out."""
+    tracks = track_set([track(3, LEVEL[:3], LEVEL[3:]), over_the_ground(0.0)], OWN)
+    cells = np.array([0.25, 0.249, resolution, resolution])
+    leeway = Leeway(cells, Ambiguity(PERIOD), tells=tells)
+    single, nobody = np.array([False, True]), np.zeros(2, bool)
+    found = suspicion(tracks, OWN, Walls(GROUND), leeway, None, nobody, single)
+    assert found.order.tolist() == [0, expected]
+
+
+def test_boards_tell_waves_apart_where_they_have_three_places():
+    """A row of eight with one transmitter half a wavelength up: two places in height."""
+    w = Waveform()
+    half = w.wavelength / 2
+    row = [(k * half, 0.0) for k in range(4)]
+    board = Antennas.placed([(0, 0), (4 * half, 0), (2 * half, half)], row)
+    assert Leeway.of(w, board, 2).tells == (True, False)
+    assert Leeway.of(w, board, 1).tells == (True, False)
+    square = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=half)
+    assert Leeway.of(w, square, 2).tells == (True, True)
+
+
+@pytest.mark.parametrize(("age", "expected"), [(0, True), (8, False)])
+def test_a_track_averages_what_pulls_it(age, expected):
+    """The image a third of a cell too far: the pull of one frame, not the mean of nine. Planted
+    bugs: the age left out; deviations averaged too."""
+    body = BODY[:3]
+    image = body * [-1, 1, 1] + [2 * WALL_X, 0, 0]
+    own = OWN.position - ORIGIN
+    far = image + 0.135 * (image - own) / np.linalg.norm(image - own)
+    seen = track(5, far, BODY[3:] * [-1, 1, 1])
+    seen.age = age
+    tracks = track_set([track(3, body, BODY[3:]), seen], OWN)
+    leeway = Leeway(RESOLUTION, Ambiguity(PERIOD))
+    found = suspicion(tracks, OWN, Walls(wall()), leeway, asked=np.zeros(2, bool))
+    assert (found.mirrored[1] >= 0) == expected
+
+
+def test_a_target_among_others_is_likelier_than_an_echo():
+    """The chance by hand, of an image with another target 2 m before it: the density of targets a
+    metre, metre a second and direction cosine squared, over that of the echo's measures. Behind a
+    wall there is none. Planted bugs: a track counts for itself; the pull taken for a deviation."""
+    body, image = BODY[:3], BODY[:3] * [-1, 1, 1] + [2 * WALL_X, 0, 0]
+    own = OWN.position - ORIGIN
+    along = (image - own) / np.linalg.norm(image - own)
+    tracks = track_set(
+        [
+            track(3, body, BODY[3:]),
+            track(5, image, BODY[3:] * [-1, 1, 1]),
+            track(7, image - 2 * along, BODY[3:] * [-1, 1, 1]),
+        ],
+        OWN,
+    )
+    leeway = Leeway(RESOLUTION, Ambiguity(PERIOD))
+    found = suspicion(tracks, OWN, Walls(wall()), leeway, asked=np.zeros(3, bool))
+    z, apart = tracks.measured, np.array([3.0, 1.0, 0.1, 0.1])
+    off = (z[1] - z[[0, 2]]) / apart
+    density = np.exp(-(off**2).sum(axis=1) / 2).sum() / (4 * np.pi**2 * apart.prod())
+    std = np.sqrt(tracks.std[0] ** 2 + tracks.std[1] ** 2 + RESOLUTION**2 / 12)
+    assert found.chance[1] == pytest.approx(density * 4 * np.pi**2 * std.prod(), rel=0.02)
+    assert np.isinf(found.chance[0])
+    behind = suspicion(tracks, OWN, Walls(wall()), leeway)
+    assert behind.chance[1] == 0
+
+
 def followed(tracker: Tracker, ghosts: Ghosts, reports: Sequence[Gaussian]) -> bool:
     """A frame shows the one track of a tracker; return whether it is reported after it."""
     (one,) = tracker.tracks
