@@ -262,8 +262,12 @@ class Arrays:
 @lru_cache(maxsize=64)
 def _places(antennas: Antennas, passes: int) -> tuple[int, int]:
     positions = antennas.virtual_positions if passes == 2 else antennas.rx_positions
-    steps = np.diff(np.sort(positions, axis=0), axis=0) > SAME_POSITION_M
-    return 1 + int(steps[:, 0].sum()), 1 + int(steps[:, 2].sum())
+    return different(positions[:, 0]), different(positions[:, 2])
+
+
+def different(along: np.ndarray) -> int:
+    """Number of different places among those of elements (L,) [m]."""
+    return np.unique(np.round(along / SAME_POSITION_M)).size
 
 
 @lru_cache(maxsize=64)
@@ -355,5 +359,5 @@ def resolutions(waveform: Waveform, antennas: Antennas, passes: int) -> np.ndarr
 def aperture_of(along: np.ndarray) -> float:
     """Length [m] of an array with elements at `along` (L,): from the first to the last and one mean
     step more, which is n d of a filled row; next to nothing where all stand at one place."""
-    steps = np.unique(np.round(along / SAME_POSITION_M)).size - 1
+    steps = different(along) - 1
     return float(np.ptp(along) * (steps + 1) / steps) if steps else SAME_POSITION_M

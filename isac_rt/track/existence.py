@@ -8,10 +8,10 @@ grows by
 .. math:: \ln\frac{p_D}{p_A} \text{ if the frame shows it}, \qquad
     \ln\frac{1 - p_D}{1 - p_A} \text{ if not},
 
-and by :math:`\ln(p_A p_C)` more where the frame shows what a known artefact must show, as a
-target's echo over a wall: :math:`p_C` is the density of targets there over that of the artefact's
-measures, at most 1. This is the recursion of Musicki, Evans and Stankovic [1]_ with artefacts in
-place of uniform clutter. The track's own record of n detections in N frames says
+and by :math:`\ln(p_A p_C)` more, where that is less than 0 and the frame shows what a known
+artefact must show, as a target's echo over a wall: :math:`p_C` is the density of targets there over
+that of the artefact's measures. This is the recursion of Musicki, Evans and Stankovic [1]_ with
+artefacts in place of uniform clutter. The track's own record of n detections in N frames says
 :math:`p_D = (n + 1) / (N + 2)` (Laplace's rule of succession).
 
 References
@@ -30,7 +30,7 @@ RECURS = 0.1
 """p_A: share of the frames in which an artefact is found where its track expects it."""
 SURE = log(200)
 """Most that a record says: a target may leave or hide."""
-LEAST_CHANCE = 0.2
+LEAST_RATIO = 0.2
 """p_C at the least: a mesh, or a track that is taken for a source, may be wrong."""
 
 
@@ -44,6 +44,6 @@ def updated(
     return min(odds + said, SURE)
 
 
-def explained(chance: float) -> float:
-    """Return what a detection says less if a known artefact explains it, with the `chance` p_C."""
-    return log(RECURS * max(chance, LEAST_CHANCE))
+def explained(ratio: float) -> float:
+    """Return what a detection says less if a known artefact explains it, with the `ratio` p_C."""
+    return log(RECURS * max(ratio, LEAST_RATIO))

@@ -266,12 +266,12 @@ class Tracker(Stateful):
         """End some tracks."""
         self.state.tracks = [t for t in self.tracks if t.id not in ids]
 
-    def doubt(self, chances: Mapping[int, float]) -> None:
-        """Take it that an artefact explains this frame's detections of tracks, {id: chance that a
-        target is there all the same}; from 1 on it says nothing."""
+    def doubt(self, ratios: Mapping[int, float]) -> None:
+        """Take it that an artefact explains this frame's detections of tracks, {id: p_C of
+        `existence`}; what is likelier as a target's is left alone."""
         for track in self.tracks:
-            if track.detection >= 0 and chances.get(track.id, 1.0) < 1:
-                track.odds += existence.explained(chances[track.id])
+            if track.detection >= 0 and track.id in ratios:
+                track.odds += min(existence.explained(ratios[track.id]), 0.0)
 
     def predict(self, time: float) -> None:
         """Bring all tracks to `time` [s]."""

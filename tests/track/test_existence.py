@@ -53,17 +53,18 @@ def test_odds_are_those_of_a_probability_of_which_nothing_is_known(misses):
 
 
 def test_an_artefact_says_by_the_odds_against_it_what_it_may():
-    """Log-odds of p_A p_C, of p_C no less than one in five; from p_C of 1 on a track is left alone,
-    as without a detection. Planted bugs: no least; what the least says where nothing explains."""
-    for chance, said in ((0.7, np.log(0.07)), (0.01, np.log(0.02)), (0.0, np.log(0.02)), (1.3, 0)):
+    """Log-odds of p_A p_C, of p_C no less than one in five; from p_C of 10 on a track is left
+    alone, as without a detection. Planted bugs: no least; tracks gain by it; a jump at p_C of 1."""
+    least = np.log(0.02)
+    for ratio, said in ((1.3, np.log(0.13)), (0.01, least), (0.0, least), (12.0, 0), (np.inf, 0)):
         tracker = in_a_city()
         tracker.update(seen(0.0), OWN)
         (track,) = tracker.tracks
-        tracker.doubt({track.id: chance})
-        assert track.odds - existence.BIRTH == pytest.approx(0 if chance > 1 else said)
+        tracker.doubt({track.id: ratio})
+        assert track.odds - existence.BIRTH == pytest.approx(said)
         track.detection = -1
         before = track.odds
-        tracker.doubt({track.id: chance})
+        tracker.doubt({track.id: ratio})
         assert track.odds == before
 
 

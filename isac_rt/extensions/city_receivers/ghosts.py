@@ -19,8 +19,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtr
 
 from isac_rt.extensions.city_receivers.walls import Walls, lengths
 from isac_rt.frame.antennas import Antennas, folded, resolutions
@@ -39,12 +41,12 @@ MEETING = 1e-9
 RESOLUTION_SHARE = 0.5
 """Share of the resolution that it may be off besides: echoes that share a cell pull each other's
 estimates."""
-AVERAGED = 9
-"""Most frames over which a track averages the pull on its range and its rate."""
 ONE_WAY_SHARE = 2.0
 """The same for the direction of an echo over a wall on one way at an active terminal: its transmit
 antennas see another direction than its receive antennas, so that the halves of the virtual array do
 not join, and the receive antennas' resolution is twice as wide."""
+AVERAGED = 9
+"""Most frames over which a track averages the pull on its range and its rate."""
 ECHO_WAVES = 2.0
 """Waves of equal power that an echo over a wall on one way consists of: out over the wall, and
 back."""
@@ -52,8 +54,8 @@ ALIKE = 4.0
 """Factor in power within which the waves of such an echo are found, and over the noise from which
 on both are."""
 APART = np.array([3.0, 1.0, 0.1, 0.1])
-"""Deviations of a target's range [m], rate [m/s] and direction cosines from another's: swarms fly
-in formations."""
+"""Deviations of a target's range [m], rate [m/s] and direction cosines from another's, over one
+pass or two: swarms fly in formations."""
 CROSSING_M = 3.0
 """Tracks that were reported before are held against the walls so near to them [m]: one that lay
 before all walls comes by here on its way behind one."""
@@ -96,7 +98,7 @@ class Ghosts(TrackRule):
         )
         rows = np.isin(tracks.ids, [*asked]) & ~tracks.is_reference
         said = suspicion(tracks, own.pose, self._walls, self._leeway, others, rows, single)
-        tracker.doubt(dict(zip(tracks.ids.tolist(), said.chance.tolist(), strict=True)))
+        tracker.doubt(dict(zip(tracks.ids.tolist(), said.ratio.tolist(), strict=True)))
 
 
 @dataclass(frozen=True)
@@ -129,8 +131,7 @@ class Leeway:
     def off(self, difference: np.ndarray) -> np.ndarray:
         """Return differences (..., 4) of paths' measures, the least that ambiguities leave."""
         off = wrapped(difference, self.ambiguity)
-        off[..., 2:] = folded(off[..., 2:], self.cosine_period)
-        return off
+        return np.concatenate([off[..., :2], folded(off[..., 2:], self.cosine_period)], axis=-1)
 
     def pull(self, one_way: bool | np.ndarray = False, age: int | np.ndarray = 0) -> np.ndarray:
         """Return by how much (..., 4) other echoes may change what a track of an `age` [frames]
@@ -148,8 +149,7 @@ class Leeway:
     def apart(self, paths: np.ndarray) -> np.ndarray:
         """(P,) whether the array tells the two waves of an echo over a wall on one way apart, of
         `echoes` (P, 4)."""
-        direct, mirrored = paths[0::4, 2:], paths[3::4, 2:]
-        off = np.abs(mirrored - direct) > self.resolution[2:]
+        off = np.abs(self.off(paths[3::4] - paths[0::4]))[:, 2:] > self.resolution[2:]
         return np.repeat((off & self.tells).any(axis=1), 4)
 
 
@@ -166,20 +166,20 @@ class Suspicion:
         passive terminal the second wall may be another; `mirrored` is the first
     behind : (K,) int32 face that hides the place of the track from the terminal or, at a passive
         one, from its transmitter, -1: it is in sight
-    chance : (K,) odds against these of a target that is there all the same; inf: nothing speaks
-        against it
+    ratio : (K,) density of targets there over that of the echo's measures, 0 behind a face; inf:
+        nothing speaks against a target
     """
 
     mirrored: np.ndarray
     source: np.ndarray
     order: np.ndarray
     behind: np.ndarray
-    chance: np.ndarray
+    ratio: np.ndarray
 
     @property
     def suspect(self) -> np.ndarray:
-        """(K,) bool"""
-        return (self.mirrored >= 0) | (self.behind >= 0)
+        """(K,) bool, a target less probably than an echo"""
+        return np.asarray(self.ratio < 1)
 
 
 def suspicion(
@@ -226,18 +226,46 @@ def suspicion(
     sources = [(tracks, int(s)) for s in np.flatnonzero(tracks.confirmed & (out.behind < 0))]
     if reported is not None:
         sources += [(reported, int(s)) for s in np.flatnonzero(held.useful(reported))]
-    for known, s in sources:
-        shown = held.shown(known, s)
-        if not shown:
-            continue
-        faces, orders, paths = (np.array(of) for of in zip(*shown, strict=True))
-        chance = held.chances(known, s, faces, orders, paths, single)
-        which, least = chance.argmin(axis=1), chance.min(axis=1)
-        new = least < out.chance
-        out.mirrored[new], out.order[new] = faces[which[new]], orders[which[new]]
-        out.source[new], out.chance[new] = known.ids[s], least[new]
-    out.chance[out.behind >= 0] = 0.0
+    shown = [(known, s, held.explained(known, s, single)) for known, s in sources]
+    paths = [(known, s, paths) for known, s, paths in shown if paths is not None]
+    is_target = tracks.confirmed & ~tracks.is_reference & (out.behind < 0)
+    for _, _, of in paths:
+        is_target[of.row] = False
+    for known, s, of in paths:
+        ratio = held.density(of, is_target) / of.likelihood
+        for i in np.argsort(-ratio, kind="stable"):  # the least one last
+            k = of.row[i]
+            if ratio[i] < out.ratio[k]:
+                out.mirrored[k], out.order[k] = of.faces[i], of.orders[i]
+                out.source[k], out.ratio[k] = known.ids[s], ratio[i]
+    out.ratio[out.behind >= 0] = 0.0
     return out
+
+
+class _Explained(NamedTuple):
+    """Pairs (n,) of a track and a path of a source that explains it.
+
+    Attributes
+    ----------
+    row : of the track
+    faces, orders : of the path
+    off, std, pull : (n, 4) by how much the track is off, deviations, and the most that other echoes
+        change
+    """
+
+    row: np.ndarray
+    faces: np.ndarray
+    orders: np.ndarray
+    off: np.ndarray
+    std: np.ndarray
+    pull: np.ndarray
+
+    @property
+    def likelihood(self) -> np.ndarray:
+        """(n,) density of normal errors and pulls that are alike up to the most."""
+        off = np.abs(self.off)
+        share = ndtr((self.pull - off) / self.std) - ndtr((-self.pull - off) / self.std)
+        return np.asarray((share / (2 * self.pull)).prod(axis=1))
 
 
 @dataclass(frozen=True)
@@ -261,15 +289,16 @@ class _Held:
         here = self.own.position
         return [here] if self.sender is None else [here, here + self.sender[:3]]
 
-    @cached_property
-    def density(self) -> np.ndarray:
-        """(K,) how many targets there are by unit of range, rate and directions where tracks are,
-        by the other reported ones."""
-        tracks = self.tracks
-        others = np.flatnonzero(tracks.confirmed & ~tracks.is_reference)
-        near = _normal(tracks.measured[:, None] - tracks.measured[others], APART)
-        near[others, np.arange(len(others))] = 0.0
-        return np.asarray(near.sum(axis=1))
+    def density(self, of: _Explained, is_target: np.ndarray) -> np.ndarray:
+        """Return how many targets (n,) there are by unit of range, rate and directions where
+        tracks are measured as in `of`, by those that are targets (K,)."""
+        others = np.flatnonzero(is_target)
+        off = self.leeway.off(self.tracks.measured[of.row, None] - self.tracks.measured[others])
+        std = np.sqrt(APART**2 + of.std**2 + of.pull**2 / 3)[:, None]
+        normal = np.exp(-((off / std) ** 2).sum(axis=2) / 2) / (np.sqrt(2 * np.pi) * std).prod(
+            axis=2
+        )
+        return np.asarray(normal.sum(axis=1))
 
     def useful(self, told: TrackSet) -> np.ndarray:
         """Return which UAVs that others report (S,) may explain tracks."""
@@ -289,17 +318,13 @@ class _Held:
         start = None if known.is_reference[s] else self.sender
         return reflections(known.mean[s], start, self.own, self.walls, reach)
 
-    def chances(
-        self,
-        known: TrackSet,
-        s: int,
-        faces: np.ndarray,
-        orders: np.ndarray,
-        paths: np.ndarray,
-        single: np.ndarray | None,
-    ) -> np.ndarray:
-        """Return `Suspicion.chance` (K, P) for each path (P,) of a source; inf: no such echo."""
-        tracks, leeway = self.tracks, self.leeway
+    def explained(self, known: TrackSet, s: int, single: np.ndarray | None) -> _Explained | None:
+        """Return which tracks are echoes of a source over walls by their measures; None if walls
+        show none of it."""
+        shown, tracks, leeway = self.shown(known, s), self.tracks, self.leeway
+        if not shown:
+            return None
+        faces, orders, paths = (np.array(of) for of in zip(*shown, strict=True))
         std = np.hypot(tracks.std, known.std[s])
         may_be = ~tracks.is_reference & (tracks.range > known.range[s])
         weaker = _weaker(known, s, self.sender, tracks.range)
@@ -309,18 +334,17 @@ class _Held:
             may_be &= ~leeway.explained(off, std, leeway.pull())
         of_source, one_way = known.std[s], np.zeros(orders.shape, bool)
         if self.sender is None:
-            of_source = np.maximum(of_source, self.mirrored_std(known, s, faces))
-            one_way = orders == 1
+            mirrored = np.repeat(self.mirrored_std(known, s, faces[::4]), 4, axis=0)
+            of_source, one_way = np.maximum(of_source, mirrored), orders == 1
         off = leeway.off(tracks.measured[:, None] - paths)
         std = np.hypot(tracks.std[:, None], of_source)
         pull = leeway.pull(one_way, tracks.age[:, None])
         hit = leeway.explained(off, std, pull) & may_be[:, None]
         if single is not None and self.sender is None:
             hit &= ~(single[:, None] & one_way & leeway.apart(paths))
-        std, out = np.hypot(std, pull / np.sqrt(3)), np.full(hit.shape, np.inf)
         row, path = np.nonzero(hit)
-        out[row, path] = self.density[row] / _normal(off[row, path], std[row, path])
-        return out
+        of_pair = (a[row, path] for a in np.broadcast_arrays(off, std, pull))
+        return _Explained(row, faces[path], orders[path], *of_pair)
 
     def mirrored_std(self, known: TrackSet, s: int, faces: np.ndarray) -> np.ndarray:
         """Return deviations (P, 4) of what a source shows in mirrors of such faces (P,): a height
@@ -335,18 +359,12 @@ class _Held:
         return reported(states, own)[1]
 
 
-def _normal(off: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Return the density of normal differences (..., 4)."""
-    exponent = -((off / std) ** 2).sum(axis=-1) / 2
-    return np.asarray(np.exp(exponent) / (np.sqrt(2 * np.pi) * std).prod(axis=-1))
-
-
 def alone(d: Detections, leeway: Leeway) -> np.ndarray:
     """Return which detections (Q,) are too strong for an echo over a wall on one way without its
     other wave, which comes from elsewhere."""
-    off = np.abs(wrapped(d.measured[:, None] - d.measured, leeway.ambiguity))
-    near = off < leeway.resolution
-    other = near[..., :2].all(axis=2) & ~near[..., 2:].all(axis=2)
+    off = np.abs(leeway.off(d.measured[:, None] - d.measured))
+    near, far = off < leeway.resolution, off >= leeway.resolution  # neither without a direction
+    other = near[..., :2].all(axis=2) & far[..., 2:].any(axis=2)
     other &= ALIKE * d.snr > d.snr[:, None]
     return np.asarray((d.snr > ALIKE) & ~other.any(axis=1))
 

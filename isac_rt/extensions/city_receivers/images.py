@@ -30,9 +30,7 @@ WELL_INSIDE = 0.95
 """Share of the view's largest cosines within which a direction is no alias of one outside."""
 ALIAS_DEVIATIONS = 3.0
 """So many deviations further inside at a passive terminal, whose array is half as long."""
-ROUNDING = 1e-9
-"""Of squared cosines between planes."""
-CORNER_STEPS_M = 0.02, EDGE, 2 * EDGE
+CORNER_STEPS_M = 0.02, 2 * EDGE
 """From the edge of a corner on each plane [m]: a roof's wall may end a hand above it, and planes
 need not meet."""
 
@@ -164,7 +162,7 @@ def _by_two(
         for k, end_of in ((i, start), (j, end))
     )
     sends, along = np.linalg.norm(A - B, axis=1) > EDGE, np.vecdot(n, m)[:, None]
-    at = np.flatnonzero(~sends & (along[:, 0] ** 2 < 1 - ROUNDING))  # no corner of parallel planes
+    at = np.flatnonzero(~sends)
     sends[at] = True
     for k, place, ahead in ((i, A, m - along * n), (j, B, n - along * m)):
         steps = np.multiply.outer(CORNER_STEPS_M, _unit(ahead[at]))

@@ -67,7 +67,7 @@ class StaticClutter(TrackRule):
         self, cosine_period: np.ndarray | float, walls: Walls | None, velocity_period: float
     ) -> None:
         self._walls, self._period = walls, velocity_period
-        self._crowd = self._unsure = np.zeros(0, bool)
+        self._crowd = np.zeros(0, bool)
         self.state = StaticSpots()
         by = [(0.0, -t, t) if np.isfinite(t) else (0.0,) for t in np.broadcast_to(cosine_period, 2)]
         self._aliases = np.array([(x, z) for x in by[0] for z in by[1]])
@@ -82,37 +82,39 @@ class StaticClutter(TrackRule):
 
     def candidates(self, detections: Detections, own: Ownship) -> Detections:
         sender = None if own.transmitter is None else own.transmitter.mean[:6]
-        self._crowd = self._unsure = np.zeros(len(detections), bool)
+        self._crowd = np.zeros(len(detections), bool)
         if own.clutter_known:
             self._crowd = self.update(detections, own.pose, own.time, sender)
-        else:  # the city's own echoes are among those that stand still
-            self._unsure, _ = self.still(detections, own.pose, sender)
         return replace(detections, starts=detections.starts & ~self._crowd)
 
     def prune(self, tracker: Tracker, own: Ownship) -> None:
         """End the tracks that are static within a crowd, and those, not reported before, that
         an echo of one carries on: from beyond the view and along a wall they seem
         to move. Few hits confirm no track beside a surface: chance carries it from spot to spot.
-        Static ones are confirmed once the clutter is known."""
+        None is confirmed before the clutter is known."""
         for track in (t for t in tracker.tracks if t.id in own.tentative):
             if track.confirmed and sum(track.recent) < tracker.settings.confirm_window:
                 beside = self._beside(track.state.mean[None, :3])
                 track.confirmed = int(beside.sum()) < SURFACE
-            if track.detection >= 0:
-                track.confirmed &= not self._unsure[track.detection]
+            track.confirmed &= own.clutter_known  # else it may be an echo of the city
         fed = {t.id for t in tracker.tracks if t.detection >= 0 and self._crowd[t.detection]}
         still = {t.id for t in tracker.tracks if self.holds(t)}
         tracker.drop(still | (fed & own.tentative))
 
-    def still(
-        self, d: Detections, own: Pose, sender: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return which detections (Q,) may stand still, and where (Q, 3). What would in a direction
-        that it may be an alias of stands there.
+    def update(
+        self, d: Detections, own: Pose, time: float, sender: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Take down a frame's echoes that stand still, of those that may start a track. What would
+        stand still in a direction that it may be an alias of stands there.
 
         Parameters
         ----------
+        time : of the frame [s]
         sender : at a passive terminal (6,) of its transmitter, world coordinates
+
+        Returns
+        -------
+        (Q,) which of all detections are static within a crowd
         """
         u = d.direction[:, None] + self._aliases
         far = np.linalg.norm(u, axis=-1)
@@ -128,17 +130,10 @@ class StaticClutter(TrackRule):
         allowed = STILL_MPS + 3 * np.hypot(d.std[:, 1], across)
         # between both ends of a passive link a UAV that flies along it has the rate of a still one
         tells = INITIAL_SPEED_STD * seen[each, best] > 3 * allowed
-        return tells & (off[each, best] < allowed), place[each, best]
-
-    def update(
-        self, d: Detections, own: Pose, time: float, sender: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Take down a frame's echoes that stand still at a time [s], of those that may start a
-        track, and return which of all are static within a crowd (Q,)."""
-        still, place = self.still(d, own, sender)
+        still = tells & (off[each, best] < allowed)
+        place = place[each, best]
         some = still & d.starts & ~d.is_reference
-        off = np.linalg.norm(place - own.position, axis=1) * d.std[:, 2:].max(axis=1, initial=0)
-        self._note(place[some], off[some], d.snr[some], time)
+        self._note(place[some], d.select(some), own, time)
         return still & self.crowded(place, d.snr)
 
     def _beside(self, places: np.ndarray) -> np.ndarray:
@@ -146,14 +141,17 @@ class StaticClutter(TrackRule):
         separation = np.linalg.norm(places[:, None] - self.state.spots[None, :, :3], axis=-1)
         return np.asarray((separation > BESIDE_M[0]) & (separation < BESIDE_M[1]))
 
-    def _note(self, places: np.ndarray, off: np.ndarray, snr: np.ndarray, time: float) -> None:
-        """Follow the spots to a frame's echoes (n, 3), whose places have deviations `off` (n,) [m]:
-        each echo carries on the nearest one."""
-        state = self.state
+    def _note(self, places: np.ndarray, d: Detections, own: Pose, time: float) -> None:
+        """Follow the spots to a frame's echoes at places (n, 3), within three deviations in
+        direction."""
+        state, snr = self.state, d.snr
         old = state.spots[state.spots[:, 4] > time - MEMORY_S]
-        separation = np.linalg.norm(places[:, None] - old[None, :, :3], axis=-1)
-        same = separation < np.maximum(BESIDE_M[0], 3 * off[:, None])
-        pairs = assign(np.where(same, separation, np.inf))
+        far = np.linalg.norm(places - own.position, axis=1)
+        off = own.to_body(places[:, None] - old[None, :, :3])
+        most = np.full((len(d), 3), BESIDE_M[0])
+        most[:, [0, 2]] = np.maximum(most[:, [0, 2]], 3 * far[:, None] * d.std[:, 2:])
+        separation = np.linalg.norm(off / most[:, None], axis=-1)
+        pairs = assign(np.where(separation < 1, separation, np.inf))
         echo, spot = np.array(pairs, int).reshape(-1, 2).T
         old[spot, :5] = np.column_stack([places, snr, np.full(len(snr), time)])[echo]
         old[spot, 5] += 1

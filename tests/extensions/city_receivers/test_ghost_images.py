@@ -291,7 +291,7 @@ def test_how_far_off_an_echo_may_be(component):
                 moved[component] += away * share * limit
             moved[1] += periods * PERIOD
             answers.append(
-                bool(asked([source, track(9, before_the_wall(moved), spread)]).suspect[1])
+                asked([source, track(9, before_the_wall(moved), spread)]).mirrored[1] >= 0
             )
         assert answers == [True, False]
 
