@@ -295,10 +295,8 @@ class _Held:
         others = np.flatnonzero(is_target)
         off = self.leeway.off(self.tracks.measured[of.row, None] - self.tracks.measured[others])
         std = np.sqrt(APART**2 + of.std**2 + of.pull**2 / 3)[:, None]
-        normal = np.exp(-((off / std) ** 2).sum(axis=2) / 2) / (np.sqrt(2 * np.pi) * std).prod(
-            axis=2
-        )
-        return np.asarray(normal.sum(axis=1))
+        peak = 1 / (np.sqrt(2 * np.pi) * std).prod(axis=2)
+        return np.asarray((peak * np.exp(-((off / std) ** 2).sum(axis=2) / 2)).sum(axis=1))
 
     def useful(self, told: TrackSet) -> np.ndarray:
         """Return which UAVs that others report (S,) may explain tracks."""
@@ -320,7 +318,7 @@ class _Held:
 
     def explained(self, known: TrackSet, s: int, single: np.ndarray | None) -> _Explained | None:
         """Return which tracks are echoes of a source over walls by their measures; None if walls
-        show none of it."""
+        show none of it. At a passive terminal these are as uncertain as its direct echo's."""
         shown, tracks, leeway = self.shown(known, s), self.tracks, self.leeway
         if not shown:
             return None
