@@ -12,9 +12,9 @@ from isac_rt.world.mirrors import mirror_image
 from isac_rt.world.passage import beside, hits
 from isac_rt.world.swarm import Pose
 
-SMALLEST_WALL = 8.0
-"""Area of a plane's faces together [m^2] below which it is not taken for a mirror: bays and gables
-of 10 m^2 showed UAVs over San Francisco."""
+SMALLEST_WALL = 1.0
+"""Area of a plane's faces together [m^2] below which it is not taken for a mirror: a car's side is
+one, for the first Fresnel zone at 77 GHz is 0.3 m wide 40 m away."""
 AT_WALL = 1e-4
 """Share of a segment at its ends that may touch what it ends on."""
 

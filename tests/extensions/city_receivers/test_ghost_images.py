@@ -176,14 +176,16 @@ def test_a_wall_between_two_is_no_mirror():
 
 
 def test_what_is_a_mirror():
-    """A wall of two triangles of 7.8 m^2 together is none, of 8.2 m^2 (4.1 each) it is, and so
-    are two walls in one plane of less than 8 m^2 each, between which nothing reflects; the face
-    that is named is the plane's largest. Planted bugs: the largest face's area asked; any wall
+    """A wall of two triangles of 0.98 m^2 together is none, of 1.02 m^2 it is, and so are two of
+    0.88 and 0.96 m^2 in one plane, between which nothing reflects; the face that is named is the
+    plane's largest. Planted bugs: the largest face's area asked; any wall
     taken; the plane endless; another plane behind taken for this one."""
-    small = mesh(rectangle(0, EAST, (8.0, 11.9), (-1.0, 1.0)))
+    small = mesh(rectangle(0, EAST, (8.0, 8.49), (-1.0, 1.0)))
     assert small.mirrors[0].size == 0
-    enough = mesh(rectangle(0, EAST, (8.0, 12.1), (-1.0, 1.0)))
+    enough = mesh(rectangle(0, EAST, (8.0, 8.51), (-1.0, 1.0)))
     assert enough.mirrors[0].size == 1
+    apart = [rectangle(0, EAST, y, (2.6, 2.76)) for y in ((5.0, 10.5), (17.0, 23.0))]
+    assert mesh(*apart).mirrors[0].size == 1
     parts = [rectangle(0, EAST, y, (2.6, 3.8)) for y in ((5.0, 10.5), (17.0, 23.5))]
     two = mesh(*parts)
     faces, normals, offsets = two.mirrors

@@ -131,6 +131,17 @@ def test_the_corner_of_a_house_sends_nothing_back():
     np.testing.assert_allclose(terrace, expected, atol=1e-8)
 
 
+@pytest.mark.parametrize(("width", "corner"), [(2.0, True), (0.9, False)])
+def test_a_car_and_the_ground_are_a_corner(width, corner):
+    """A plate of 1.4 m^2 that stands on the ground sends back, one of 0.6 m^2 is no mirror. Planted
+    bug: only planes of 8 m^2 and more."""
+    y = -3.1 + width / 2 * np.array([-1, 1])
+    plate = [[8.0, y[0], 0.0], [8.0, y[1], 0.0], [8.0, y[1], 0.7], [8.0, y[0], 0.7]]
+    ground = [[-40.0, -40.0, 0.0], [40.0, -40.0, 0.0], [40.0, 40.0, 0.0], [-40.0, 40.0, 0.0]]
+    found = unique(own_images(OWN, city(plate, ground), 100.0))[:, 0]
+    np.testing.assert_allclose(found, [4.2, np.hypot(6.3, 4.2)][: 1 + corner], atol=1e-8)
+
+
 def within_a_face(walls: Walls, mirror: int, point: np.ndarray) -> bool:
     """Whether a place in a mirror's plane is off a face's sides by 0.3 m at most, by barycentric
     coordinates and the altitudes that they are shares of."""
