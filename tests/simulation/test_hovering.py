@@ -21,18 +21,16 @@ HOVERING = (
 @pytest.mark.slow
 @pytest.mark.sionna
 def test_uavs_that_hover_are_found_and_followed():
-    """Both terminals find and follow both. Tracked were 13 and 13 of 16 frames at PT1, 14 of U4 and
-    10 of U1 at the AT, which finds U1, in the cells of its wall, in 14: a track is confirmed by its
-    third detection, and PT1 needs two frames to acquire. The one false track is the AT's, U1's echo
-    over the wall in three frames: as long as nothing is known of how U1 flies across, neither is
-    the rate of that echo."""
+    """Both terminals find and follow both: 14 and 14 of 16 frames at PT1, which needs two frames to
+    acquire and three detections, 15 and 15 at the AT. That finds U1, in the cells of its wall, with
+    both directions in 11; in the others the wall leaves one open. No track is false."""
     blocks = simulate.run(load(SCENE, HOVERING, frames=16), snapshots=0).summary["terminals"]
     targets = {name: block["targets"] for name, block in blocks.items()}
     assert [targets["PT1"][name]["found"] for name in ("U1", "U4")] == [16, 16]
-    assert [targets["PT1"][name]["tracked"] >= 12 for name in ("U1", "U4")] == [True, True]
+    assert [targets["PT1"][name]["tracked"] >= 13 for name in ("U1", "U4")] == [True, True]
     assert targets["AT"]["U4"]["found"] == 16
-    assert targets["AT"]["U1"]["found"] >= 12
-    assert targets["AT"]["U4"]["tracked"] >= 13
-    assert targets["AT"]["U1"]["tracked"] >= 8
+    assert targets["AT"]["U1"]["found"] >= 11
+    assert targets["AT"]["U4"]["tracked"] >= 14
+    assert targets["AT"]["U1"]["tracked"] >= 13
     assert blocks["PT1"]["false_tracks_per_frame"] < 0.1
-    assert blocks["AT"]["false_tracks_per_frame"] < 0.25
+    assert blocks["AT"]["false_tracks_per_frame"] < 0.1
