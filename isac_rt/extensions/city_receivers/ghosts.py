@@ -226,18 +226,16 @@ def suspicion(
     sources = [(tracks, int(s)) for s in np.flatnonzero(tracks.confirmed & (out.behind < 0))]
     if reported is not None:
         sources += [(reported, int(s)) for s in np.flatnonzero(held.useful(reported))]
-    shown = [(known, s, held.explained(known, s, single)) for known, s in sources]
-    paths = [(known, s, paths) for known, s, paths in shown if paths is not None]
+    found = [(known.ids[s], of) for known, s in sources if (of := held.explained(known, s, single))]
     is_target = tracks.confirmed & ~tracks.is_reference & (out.behind < 0)
-    for _, _, of in paths:
+    for _, of in found:
         is_target[of.row] = False
-    for known, s, of in paths:
+    for source, of in found:
         ratio = held.density(of, is_target) / of.likelihood
-        for i in np.argsort(-ratio, kind="stable"):  # the least one last
-            k = of.row[i]
+        for i, k in enumerate(of.row):
             if ratio[i] < out.ratio[k]:
                 out.mirrored[k], out.order[k] = of.faces[i], of.orders[i]
-                out.source[k], out.ratio[k] = known.ids[s], ratio[i]
+                out.source[k], out.ratio[k] = source, ratio[i]
     out.ratio[out.behind >= 0] = 0.0
     return out
 

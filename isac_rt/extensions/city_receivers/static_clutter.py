@@ -81,9 +81,9 @@ class StaticClutter(TrackRule):
         return cls(antennas.cosine_period(waveform.wavelength, passes), walls, period)
 
     def candidates(self, detections: Detections, own: Ownship) -> Detections:
-        sender = None if own.transmitter is None else own.transmitter.mean[:6]
         self._crowd = np.zeros(len(detections), bool)
-        if own.clutter_known:
+        if own.clutter_known:  # else the city's own echoes are among them
+            sender = None if own.transmitter is None else own.transmitter.mean[:6]
             self._crowd = self.update(detections, own.pose, own.time, sender)
         return replace(detections, starts=detections.starts & ~self._crowd)
 

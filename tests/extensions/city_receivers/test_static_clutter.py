@@ -274,7 +274,6 @@ def test_a_young_track_that_an_echo_of_a_crowd_carries_on_is_none():
     tracker.state.tracks = tracks
     static_clutter = StaticClutter(1.71, None, PERIOD)
     static_clutter._crowd = np.array([True, False])
-    static_clutter._unsure = np.zeros(2, bool)
     static_clutter.prune(tracker, Ownship(own(0.0), 0.0, tentative=frozenset({1, 3, 4, 5})))
     assert [t.id for t in tracker.tracks] == [2, 3, 5]
 
