@@ -159,11 +159,3 @@ class Walls:
         inset = AT_WALL * np.diff(polyline, axis=0)
         legs = np.stack([polyline[:-1] + inset, polyline[1:] - inset], axis=1)
         return any(self.blocking(*leg).size for leg in legs[inset.any(axis=1)])
-
-
-def lengths(targets: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return length and its rate (K, 2) of straight paths from moving UAVs (K, 6) to `end`
-    (6,)."""
-    span, moved = end[:3] - targets[:, :3], end[3:6] - targets[:, 3:6]
-    far = np.linalg.norm(span, axis=1)
-    return np.column_stack([far, (span * moved).sum(axis=1) / far])

@@ -153,13 +153,17 @@ class Cooperation(Stateful):
         return Gaussian(g.mean[:6], g.covariance[:6, :6])
 
     def _reported_uavs(self, name: str, view: View, time: float) -> list[ReportedUav]:
-        """Return the targets that a terminal knows of: other terminals by their reports, and the
-        fused tracks that are none of these."""
+        """Return the targets that a terminal knows of from others: other terminals by their
+        reports, and the fused tracks that are none of these."""
         terminals = [
             ReportedUav(other, self._coasted(s.state, time - s.time))
             for other, s in self._notes[name].terminals.items()
         ]
-        return terminals + [ReportedUav("", b.state) for b in view.fused if b.terminal is None]
+        own = {str(link) for link in self._setup.timetable.all_links if link.rx == name}
+        told = (b for b in view.fused if b.terminal is None)
+        return terminals + [
+            ReportedUav("", b.state) for b in told if {key.origin for key in b.members} - own
+        ]
 
     def reports(self, link: Link, frame: int, time: float) -> list[ReportedUav]:
         """The UAVs that a link's receiver knew of after a frame, at a time [s], but the link's

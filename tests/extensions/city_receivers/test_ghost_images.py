@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from isac_rt.extensions.city_receivers.ghosts import Leeway, echoes, reflections, suspicion
+from isac_rt.extensions.city_receivers.ghosts import Leeway, Paths, echoes, reflections, suspicion
 from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.track.filter import Ambiguity, Gaussian
 from isac_rt.track.tracker import Track, track_set
@@ -126,9 +126,10 @@ def test_reflections_are_the_images_that_each_end_sees(name):
                 start, end = (BODY if w is None else image(BODY, w) for w in (a, b))
                 ways[a, b] = [(SENDER, start), (HERE, end)]
     found = reflections(BODY - HERE, SENDER - HERE, OWN, corner(*SPANS[name]))
-    assert len(found) == len(ways)
+    assert len(found.faces) == len(ways)
     planes = {0: "east", 1: "east", 2: "north", 3: "north"}
-    rows = sorted((planes[f], o, *np.round(e, 9).tolist()) for f, o, e in found)
+    each = zip(found.faces, found.orders, found.measured, strict=True)
+    rows = sorted((planes[f], o, *np.round(e, 9).tolist()) for f, o, e in each)
     truth = sorted(
         (a or b, (a is not None) + (b is not None), *np.round(z, 9).tolist())
         for (a, b), z in seen(ways).items()
@@ -143,10 +144,8 @@ def test_the_sender_over_a_wall_is_one_way():
     found = reflections(SENDER - HERE, None, OWN, corner(*spans))
     ways = {w: [(HERE, image(SENDER, w))] for w in ("east", "north")}
     assert all(shows(w, HERE, SENDER, s) for w, s in zip(ways, spans, strict=True))
-    assert [o for _, o, _ in found] == [1, 1]
-    np.testing.assert_allclose(
-        [e for *_, e in found], list(seen(ways).values()), rtol=0, atol=1e-10
-    )
+    assert found.orders.tolist() == [1, 1]
+    np.testing.assert_allclose(found.measured, list(seen(ways).values()), rtol=0, atol=1e-10)
 
 
 def test_an_active_terminal_sees_three_echoes_and_an_image_in_each_wall():
@@ -160,10 +159,30 @@ def test_an_active_terminal_sees_three_echoes_and_an_image_in_each_wall():
         middle = (at["body"] + at[wall]) / 2
         directions = (at["body"], at[wall], middle)
         truth += [(1, [*middle[:2], *z[2:]]) for z in directions] + [(2, at[wall])]
-    rows = sorted([o, *np.round(e, 9)] for _, o, e in found)
+    rows = sorted([o, *np.round(e, 9)] for o, e in zip(found.orders, found.measured, strict=True))
     np.testing.assert_allclose(
         rows, sorted([o, *np.round(z, 9)] for o, z in truth), rtol=0, atol=1e-8
     )
+
+
+@pytest.mark.parametrize("sender", [BODY * 0, SENDER - HERE, None], ids=["own", "other", "alone"])
+def test_what_walls_show_is_as_uncertain_as_its_source(sender):
+    """Slopes by differences over 2 mm and 2 mm/s (1e-6: third derivatives over the step, and the
+    rounding of lengths), at both kinds of terminal; a deviation along one axis is that slope's.
+    Planted bugs: motion not mirrored; the way to the body left out; one range for the mean."""
+
+    def shown(state: np.ndarray) -> Paths:
+        if sender is not None and not sender.any():
+            return echoes(state, OWN, corner())
+        return reflections(state, sender, OWN, corner())
+
+    found = shown(BODY - HERE)
+    assert found.faces.size >= 2
+    for axis, step in enumerate(1e-3 * np.eye(6)):
+        slope = (shown(BODY - HERE + step).measured - shown(BODY - HERE - step).measured) / 2e-3
+        np.testing.assert_allclose(found.slopes[..., axis], slope, rtol=0, atol=1e-6)
+        std = found.std(np.outer(step, step))
+        np.testing.assert_allclose(std, 1e-3 * np.abs(slope), rtol=0, atol=1e-9)
 
 
 def test_a_wall_between_two_is_no_mirror():
@@ -172,7 +191,7 @@ def test_a_wall_between_two_is_no_mirror():
     close = BODY.copy()
     close[0] = EAST + 0.5
     for behind in (image(BODY, "east"), close):
-        assert echoes(behind - HERE, OWN, corner(north=(-25.0, -20.0))) == []
+        assert not echoes(behind - HERE, OWN, corner(north=(-25.0, -20.0))).faces.size
 
 
 def test_what_is_a_mirror():
@@ -203,9 +222,9 @@ def test_what_is_a_mirror():
         # the mirror point by similar triangles, from 12.1 m and 8.9 m before the plane
         y, further = (HERE[1] + (place - HERE[1]) * (12.1 + d) / (21 + 2 * d) for d in (0.0, 0.5))
         of_two = 5 < y < 10.5 or 17 < y < 23.5
-        assert bool(echoes(body - HERE, OWN, two)) is bool(of_two)
+        assert bool(echoes(body - HERE, OWN, two).faces.size) is bool(of_two)
         count = bool(3 < y < 10.5) + bool(17 < further < 24)
-        assert len(echoes(body - HERE, OWN, deep)) == 4 * count
+        assert echoes(body - HERE, OWN, deep).faces.size == 4 * count
         shown.add((bool(of_two), count))
     assert shown >= {(True, 1), (False, 0)}
 
@@ -320,7 +339,7 @@ def test_a_reference_is_no_ghost_and_sees_for_itself():
     found = asked([track(3, BODY)], reference=track(1, SENDER))
     assert not found.suspect.any()
     # the reference where its own reflector's echo would be: it is not asked about
-    echo = reflections(BODY - HERE, SENDER - HERE, OWN, corner(north=(13.0, 30.0)))[0][2]
+    echo = reflections(BODY - HERE, SENDER - HERE, OWN, corner(north=(13.0, 30.0))).measured[0]
     wide = track(1, SENDER, (400.0, 400.0))
     assert echo[0] > 0
     assert asked([track(3, BODY)], reference=wide).mirrored[0] == -1

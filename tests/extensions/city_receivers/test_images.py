@@ -13,11 +13,11 @@ from isac_rt.extensions.city_receivers.images import (
     _by_one,
     _by_two,
 )
-from isac_rt.extensions.city_receivers.walls import Walls, lengths
+from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
-from isac_rt.track.filter import Ambiguity, Gaussian
+from isac_rt.track.filter import Ambiguity, Gaussian, measure
 from isac_rt.track.parts import Ownship
 from isac_rt.track.settings import Tracking
 from isac_rt.track.tracker import Track, Tracker
@@ -200,7 +200,7 @@ def test_all_ways_over_one_and_two_planes_are_found():
             expected.append([far[0], (far[2] - far[1]) / 2e-4])
     found = np.concatenate(
         [
-            lengths(one(sender, here, walls, near_ends, 500.0)[0], here)
+            measure(one(sender, here, walls, near_ends, 500.0)[0], own)[:, :2]
             for one, near_ends in ((_by_one, near), (_by_two, (near, near)))
         ]
     )
