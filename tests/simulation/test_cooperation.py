@@ -240,6 +240,20 @@ def test_what_the_at_should_see_and_has_not_is_no_uav():
     assert step([alone, sharper], 3, poses, {Link("AT", "AT"): seen}) == (sharper,)
 
 
+def test_a_terminal_does_not_report_its_own_tracks_to_itself():
+    """UAVs by its own tracks, by another's and by both; one that is a terminal. Planted bug: what
+    it tracks alone comes back as a report."""
+    exchange = Cooperation(prepare(scenario()))
+    of_pt, of_at = Key("AT->PT", 4), Key("AT->AT", 2)
+    states = [Gaussian(np.full(6, float(k)), np.eye(6)) for k in range(4)]
+    members = (of_pt,), (of_at,), (of_pt, of_at), (of_at,)
+    fused = [Fused(Name(0.0, *m[0]), g, m) for m, g in zip(members, states, strict=True)]
+    fused[3] = replace(fused[3], terminal="PT")
+    for name, told in (("PT", [1.0, 2.0]), ("AT", [0.0, 2.0])):
+        heard = exchange._reported_uavs(name, SimpleNamespace(fused=fused), 0.0)
+        assert [uav.state.mean[0] for uav in heard] == told
+
+
 def noting(reports):
     """Makes standard terminals that put down by link what they are told."""
 

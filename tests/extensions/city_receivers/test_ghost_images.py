@@ -293,9 +293,10 @@ def test_a_ghost_is_farther_than_its_source():
 
 @pytest.mark.parametrize("component", range(4))
 def test_how_far_off_an_echo_may_be(component):
-    """Three deviations of both tracks together and half a resolution, two in direction, as the wall
-    is on one way alone; a whole period of velocity is no difference. Planted bugs: the source's
-    deviation left out; deviations added; no resolution; velocities not folded."""
+    """Three deviations of both tracks together, the source's one and a half times, and half a
+    resolution, two in direction, as the wall is on one way alone; a whole period of velocity is no
+    difference. Planted bugs: the source's deviation left out; deviations added; no resolution;
+    velocities not folded."""
     source, spread = track(4, BODY, (0.01, 0.04)), (0.02, 0.09)
     z, resolutions = half_echo(), 2.0 if component >= 2 else 0.5
     away = -1 if component == 2 else 1  # not towards the image
@@ -306,7 +307,7 @@ def test_how_far_off_an_echo_may_be(component):
             for _ in range(3):  # the deviations move a little with the place
                 trial = track(9, before_the_wall(moved), spread)
                 both = track_set([source, trial], OWN)
-                limit = 3 * np.hypot(*both.std)[component]
+                limit = 3 * np.hypot(1.5 * both.std[0], both.std[1])[component]
                 limit += resolutions * RESOLUTION[component]
                 moved = z.copy()
                 moved[component] += away * share * limit

@@ -28,7 +28,7 @@ from isac_rt.track import existence
 from isac_rt.track.filter import Ambiguity, Gaussian
 from isac_rt.track.parts import Ownship, ReportedUav
 from isac_rt.track.settings import Tracking
-from isac_rt.track.tracker import Track, Tracker, track_set
+from isac_rt.track.tracker import Track, Tracker, TrackSet, track_set
 from isac_rt.world.city.mesh import CityMesh
 from isac_rt.world.swarm import Pose
 from reproduce.ghosts import explained_tracks, run, verdicts, whole_tracks
@@ -277,12 +277,12 @@ def test_boards_tell_waves_apart_where_they_have_three_places():
 
 @pytest.mark.parametrize(("age", "expected"), [(0, True), (8, False)])
 def test_a_track_averages_what_pulls_it(age, expected):
-    """The image a third of a cell too far: the pull of one frame, not the mean of nine. Planted
-    bugs: the age left out; deviations averaged too."""
+    """The image 0.19 m too far, where half a cell is 0.125 m and three deviations 0.11 m: the pull
+    of one frame, not the mean of nine. Planted bugs: the age left out; deviations averaged too."""
     body = BODY[:3]
     image = body * [-1, 1, 1] + [2 * WALL_X, 0, 0]
     own = OWN.position - ORIGIN
-    far = image + 0.135 * (image - own) / np.linalg.norm(image - own)
+    far = image + 0.19 * (image - own) / np.linalg.norm(image - own)
     seen = track(5, far, BODY[3:] * [-1, 1, 1])
     seen.age = age
     tracks = track_set([track(3, body, BODY[3:]), seen], OWN)
@@ -300,10 +300,11 @@ def row_of_sixteen() -> Leeway:
 @pytest.mark.parametrize("board", [False, True])
 def test_a_target_among_others_is_likelier_than_an_echo(board):
     """The density of targets where an image of the body is seen, over that of the echo's measures,
-    by hand: of the body and of a target 2 m before the image, both as blurred as the track is. The
-    image does not count, nor a track behind the wall or not reported. A height that an array does
-    not observe says next to nothing. Planted bugs: a track counts for itself;
-    tracks behind walls, or tentative, are targets; no blur; pull taken for a deviation."""
+    by hand: of the body and of a target 2 m before the image, both as blurred as the track is, and
+    of one anywhere. The image does not count, nor a track behind the wall or not reported. A height
+    that an array does not observe says next to nothing. Three of ten echoes are found, and the
+    body's deviations are 1.5 times as large. Planted bugs: a track counts for itself; tracks behind
+    walls, or tentative, are targets; no blur; pull taken for a deviation; none anywhere."""
     body, image = BODY[:3], BODY[:3] * [-1, 1, 1] + [2 * WALL_X, 0, 0]
     own, back = OWN.position - ORIGIN, BODY[3:] * [-1, 1, 1]
     along = (image - own) / np.linalg.norm(image - own)
@@ -320,17 +321,45 @@ def test_a_target_among_others_is_likelier_than_an_echo(board):
     asked = np.array([False, False, False, True, False])
     found = suspicion(tracks, OWN, Walls(wall()), leeway, asked=asked)
     z, apart = tracks.measured, np.array([3.0, 1.0, 0.1, 0.1])
-    std, pull = np.hypot(tracks.std[0], tracks.std[1]), leeway.resolution / 2
+    std, pull = np.hypot(1.5 * tracks.std[0], tracks.std[1]), leeway.resolution / 2
     blurred = np.sqrt(apart**2 + std**2 + pull**2 / 3)
     axes = slice(3) if board else slice(4)
     d2 = (((z[1] - z[[0, 2]]) / blurred) ** 2)[:, axes].sum(axis=1)
     of_targets = np.exp(-d2 / 2).sum() / (np.sqrt(2 * np.pi) * blurred)[axes].prod()
     of_echo = (special.erf(pull / std / np.sqrt(2)) / (2 * pull))[axes].prod()
     flat = np.sqrt(6 / np.pi) if board else 1.0  # a normal's peak over a flat density as wide
-    expected = flat * of_targets / of_echo
+    anywhere = 1 / (tracks.range.max() * leeway.ambiguity.period * 2 * (1 if board else 2))
+    expected = (flat * of_targets + anywhere) / (0.3 * of_echo)
     assert found.ratio[1] == pytest.approx(expected, rel=0.02)
+    rare = suspicion(tracks, OWN, Walls(wall()), leeway, asked=asked, rare=0.25)
+    np.testing.assert_allclose(rare.ratio, 0.25 * found.ratio, rtol=1e-12)
     assert np.isinf(found.ratio[0]) and found.ratio[3] == 0
     assert found.suspect.tolist() == [False, True, False, True, False]
+
+
+@pytest.mark.parametrize("spread", [0.05, 0.4])
+def test_what_others_report_is_a_target(spread):
+    """A report of a UAV where the body's image is: its density is added, by hand, as wide as both
+    are; one of 3 m beside adds nothing. Planted bugs: reports left out; as wide as neighbours."""
+    body, image = BODY[:3], BODY[:3] * [-1, 1, 1] + [2 * WALL_X, 0, 0]
+    tracks = track_set([track(3, body, BODY[3:]), track(5, image, BODY[3:] * [-1, 1, 1])], OWN)
+    leeway, none = Leeway(RESOLUTION, Ambiguity(PERIOD)), np.zeros(2, bool)
+
+    def reported(place: np.ndarray) -> TrackSet:
+        state = np.concatenate([place + ORIGIN, BODY[3:] * [-1, 1, 1]])
+        return track_set([Track.of_state(Gaussian(state, spread**2 * np.eye(6)))], OWN)
+
+    def ratio(place: np.ndarray) -> float:
+        told = reported(place)
+        return float(suspicion(tracks, OWN, Walls(wall()), leeway, told, none).ratio[1])
+
+    alone = suspicion(tracks, OWN, Walls(wall()), leeway, asked=none).ratio[1]
+    std, pull = np.hypot(1.5 * tracks.std[0], tracks.std[1]), leeway.resolution / 2
+    blurred = np.sqrt(reported(image).std[0] ** 2 + std**2 + pull**2 / 3)
+    of_echo = (special.erf(pull / std / np.sqrt(2)) / (2 * pull)).prod()
+    more = 1 / (np.sqrt(2 * np.pi) * blurred).prod() / (0.3 * of_echo)
+    assert ratio(image) - alone == pytest.approx(more, rel=0.02)
+    assert ratio(image + np.array([0.0, 3.0, 0.0])) == pytest.approx(alone, rel=0.02)
 
 
 def test_images_of_a_formation_are_no_targets():
