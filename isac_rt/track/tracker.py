@@ -37,8 +37,7 @@ from isac_rt.world.swarm import Pose
 
 SURE_HITS = 2
 """With `tracking.initiation: unexplained` a track is confirmed if so many of its detections could
-have started it: others pass a lower threshold, which strong clutter passes again and again. At an
-active terminal these are enough, for chance shows none of them twice."""
+have started it: others pass a lower threshold, which strong clutter passes again and again."""
 CLEAR_M = 0.5
 """No two UAVs are nearer to each other, and none is to a wall [m]: their arms are as long."""
 ROUNDING = 1e-9
@@ -109,7 +108,7 @@ class Track:
     hits : detections so far
     odds : logarithm of the odds that it follows a target (`isac_rt.track.existence`); infinite
         where tracks count on their hits alone
-    confirmed : enough hits were reached (`SURE_HITS`), and no rule took that back
+    confirmed : enough hits were reached, and no rule took that back
     detection : row among the frame's detections that updated it, -1: none
     last : time of the last detection [s]
     sure : detections that could have started it
@@ -244,7 +243,7 @@ class Tracker(Stateful):
 
     def __init__(self, settings: Tracking, ambiguity: Ambiguity) -> None:
         self.settings = settings
-        self.by_odds = settings.initiation == "unexplained"
+        self.by_odds = settings.needs_mesh
         self.ambiguity = ambiguity
         self.state = Followed()
 
@@ -308,7 +307,7 @@ class Tracker(Stateful):
         for k, track in enumerate(self.tracks):
             q = hit.get(k)
             track.sure += q is not None and bool(detections.starts[q])
-            self._live(track, q is not None, transmitter is None)
+            self._live(track, q is not None)
             if q is not None:
                 track.snr, track.detection = float(detections.snr[q]), q
                 track.last = self.state.time
@@ -410,7 +409,7 @@ class Tracker(Stateful):
                 vars(near[0]).update(vars(track) | record)
         return out
 
-    def _live(self, track: Track, hit: bool, active: bool) -> None:
+    def _live(self, track: Track, hit: bool) -> None:
         s = self.settings
         if self.by_odds:
             track.odds = existence.updated(track.odds, hit, track.hits, track.age + 1)
@@ -420,8 +419,7 @@ class Tracker(Stateful):
         track.recent = [*track.recent, hit][-s.confirm_window :]
         enough = sum(track.recent) >= s.confirm_hits
         if self.by_odds:
-            sure = track.sure >= min(SURE_HITS, s.confirm_hits)
-            enough = sure and (enough or active)
+            enough = track.sure >= min(SURE_HITS, s.confirm_hits)
         track.confirmed = track.confirmed or (hit and enough)
 
     def _dead(self, track: Track) -> bool:
