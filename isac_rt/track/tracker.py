@@ -37,7 +37,8 @@ from isac_rt.world.swarm import Pose
 
 SURE_HITS = 2
 """With `tracking.initiation: unexplained` a track is confirmed if so many of its detections could
-have started it: others pass a lower threshold, which strong clutter passes again and again."""
+have started it: others pass a lower threshold, which strong clutter passes again and again. Odds
+decide the rest."""
 CLEAR_M = 0.5
 """No two UAVs are nearer to each other, and none is to a wall [m]: their arms are as long."""
 ROUNDING = 1e-9
@@ -243,7 +244,7 @@ class Tracker(Stateful):
 
     def __init__(self, settings: Tracking, ambiguity: Ambiguity) -> None:
         self.settings = settings
-        self.by_odds = settings.needs_mesh
+        self.by_odds = settings.initiation == "unexplained"
         self.ambiguity = ambiguity
         self.state = Followed()
 

@@ -250,7 +250,7 @@ def test_a_terminal_does_not_report_its_own_tracks_to_itself():
     fused = [Fused(Name(0.0, *m[0]), g, m) for m, g in zip(members, states, strict=True)]
     fused[3] = replace(fused[3], terminal="PT")
     for name, told in (("PT", [1.0, 2.0]), ("AT", [0.0, 2.0])):
-        heard = exchange._reported_uavs(name, SimpleNamespace(fused=fused), 0.0)
+        heard = exchange._reported_uavs(Link("AT", name), SimpleNamespace(fused=fused), 0.0)
         assert [uav.state.mean[0] for uav in heard] == told
 
 

@@ -517,19 +517,21 @@ def test_a_track_says_which_detection_updated_it():
         assert tracker.snapshot(now).detection.tolist() == rows
 
 
+@pytest.mark.parametrize("sender", [None, Gaussian(AT, 1e-4 * np.eye(6))])
 @pytest.mark.parametrize(
     ("sure", "frame"), [((1, 1, 0, 0), 1), ((1, 0, 0, 1), 3), ((1, 0, 0, 0), None)]
 )
-def test_one_sure_detection_confirms_no_track(sure, frame):
-    """Four detections in a row, some of which could have started the track: an active terminal
-    confirms it by two that are sure. Planted bugs: any two; the first not counted."""
+def test_one_sure_detection_confirms_no_track(sure, frame, sender):
+    """Four detections in a row, some of which could have started the track: both kinds of terminal
+    confirm it by two that are sure. Planted bugs: any two; the first not counted; three at a
+    passive one."""
     settings = Tracking(initiation="unexplained")
     tracker, first = Tracker(settings, Ambiguity(np.inf, 0.0)), None
-    z = measure(BODY, OWN)
+    z = measure(BODY, OWN, None if sender is None else sender.mean)
     for n, starts in enumerate(sure):
         tracker.predict(1e-6 * n)
         one = detections(z)
-        tracker.update(replace(one, starts=np.array([bool(starts)])), OWN)
+        tracker.update(replace(one, starts=np.array([bool(starts)])), OWN, sender)
         if first is None and tracker.tracks[0].confirmed:
             first = n
     assert first == frame

@@ -28,7 +28,7 @@ from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas, folded, resolutions
 from isac_rt.frame.waveform import Waveform
 from isac_rt.receive.types import Detections
-from isac_rt.track.filter import Ambiguity, jacobian, measure, wrapped
+from isac_rt.track.filter import Ambiguity, jacobian, measure, transmitter_jacobian, wrapped
 from isac_rt.track.parts import Ownship, TrackRule
 from isac_rt.track.tracker import Track, Tracker, TrackSet, track_set
 from isac_rt.world.swarm import Pose
@@ -47,14 +47,11 @@ not join, and the receive antennas' resolution is twice as wide."""
 AVERAGED = 9
 """Most frames over which a track averages the pull on its range and its rate."""
 SHOWN = 0.3
-"""Share of the paths of UAVs over walls that are found, of UAVs that are: in twelve flights over
-six cities 0.02 to 0.38, and about 0.3 where there are many."""
+"""Probability that a frame shows the path of a UAV over a wall, if it shows the UAV: in twelve
+flights over six cities 0.02 to 0.38, and about 0.3 where there are many."""
 PULLED = 1.5
-"""Factor by which heights are farther off than their deviations say where a UAV's echo over the
-ground shares its cell: 1.3 to 1.9 on boards, which hardly observe them."""
-UNREPORTED = 0.1
-"""Share of the UAVs that an active terminal sees and does not report. It sees all whose echoes a
-passive one receives."""
+"""Factor by which what walls show of a UAV is farther off than the deviations of its state say: its
+echo over the ground pulls its height on boards, where it is off by 1.3 to 1.9 deviations (rms)."""
 STRADDLED, IN_PHASE = 2.0, 4.0
 """Factors in power by which a path over walls may exceed what lengths allow: for cells that its
 source straddles, and at an active terminal for the two waves of an echo over a wall on one way, out
@@ -106,9 +103,7 @@ class Ghosts(TrackRule):
             (tracks.detection >= 0) & self._alone[tracks.detection] if self._alone.size else None
         )
         rows = np.isin(tracks.ids, [*asked]) & ~tracks.is_reference
-        told = own.reference is not None and any(not uav.terminal for uav in own.reports)
-        rare = UNREPORTED if told else 1.0
-        said = suspicion(tracks, own.pose, self._walls, self._leeway, others, rows, single, rare)
+        said = suspicion(tracks, own.pose, self._walls, self._leeway, others, rows, single)
         tracker.doubt(dict(zip(tracks.ids.tolist(), said.ratio.tolist(), strict=True)))
 
 
@@ -177,8 +172,8 @@ class Suspicion:
         passive terminal the second wall may be another; `mirrored` is the first
     behind : (K,) int32 face that hides the place of the track from the terminal or, at a passive
         one, from its transmitter, -1: it is in sight
-    ratio : (K,) density of targets there over that of the echo's measures, 0 behind a face; inf:
-        nothing speaks against a target
+    ratio : (K,) density of targets there over that of the echo's measures, if the frame shows it
+        (`SHOWN`), 0 behind a face; inf: nothing speaks against a target
     """
 
     mirrored: np.ndarray
@@ -201,7 +196,6 @@ def suspicion(
     reported: TrackSet | None = None,
     asked: np.ndarray | None = None,
     single: np.ndarray | None = None,
-    rare: float = 1.0,
 ) -> Suspicion:
     """Hold the tracks of a terminal against the mesh.
 
@@ -217,7 +211,6 @@ def suspicion(
         active terminal tracks itself
     asked : (K,) bool, the tracks that may lie behind a wall; None: all but the reference
     single : (K,) bool, those whose detection is `alone`; None: none
-    rare : share of the targets that others would not report
     """
     count = len(tracks)
     out = Suspicion(
@@ -244,7 +237,7 @@ def suspicion(
     for of in found:
         is_target[of.row] = False
     for of in found:
-        ratio = held.density(of, is_target, reported, rare) / (SHOWN * of.likelihood)
+        ratio = held.density(of, is_target, reported) / (SHOWN * of.likelihood)
         for i, k in enumerate(of.row):
             if ratio[i] < out.ratio[k]:
                 out.mirrored[k], out.order[k] = of.faces[i], of.orders[i]
@@ -259,7 +252,7 @@ class _Explained(NamedTuple):
     Attributes
     ----------
     row : of the track
-    source : id of the source
+    source, report : id of the source, and its row among those that others report, -1: it is none
     faces, orders : of the path
     off, std, pull : (n, 4) by how much the track is off, deviations, and the most that other echoes
         change
@@ -267,6 +260,7 @@ class _Explained(NamedTuple):
 
     row: np.ndarray
     source: int
+    report: int
     faces: np.ndarray
     orders: np.ndarray
     off: np.ndarray
@@ -302,25 +296,35 @@ class _Held:
         here = self.own.position
         return [here] if self.sender is None else [here, here + self.sender[:3]]
 
-    def density(
-        self, of: _Explained, is_target: np.ndarray, told: TrackSet | None, rare: float
-    ) -> np.ndarray:
-        """Return how many targets (n,) there are by unit of range, rate and directions where
-        tracks are measured as in `of`: about those that are targets (K,), where others report one,
-        and one anywhere."""
-        z, leeway = self.tracks.measured, self.leeway
-        span = self.tracks.range.max(), leeway.ambiguity.period, 2.0, 2.0
-        out = rare / np.maximum(span, 2 * of.pull).prod(axis=1)
-        known = [(z[is_target], APART, rare)]
+    def density(self, of: _Explained, is_target: np.ndarray, told: TrackSet | None) -> np.ndarray:
+        """Return how many targets (n,) there are by unit of range [m], rate [m/s] and direction
+        cosines where tracks are measured as in `of`: about those that are targets (K,), one
+        anywhere, and one where others report one that the track fits best."""
+        z, std, leeway = self.tracks.measured[of.row], self.tracks.std[of.row], self.leeway
+        span = np.array([self.tracks.range.max(), leeway.ambiguity.period, 2.0, 2.0])
+        span[2:] = np.minimum(span[2:], leeway.cosine_period)
+        out = 1 / np.maximum(span, 2 * of.pull).prod(axis=1)
+
+        def near(places: np.ndarray, apart: np.ndarray) -> np.ndarray:
+            blurred = np.sqrt(apart**2 + (std**2 + of.pull**2 / 3)[:, None])
+            off = leeway.off(z[:, None] - places) / blurred
+            peak = 1 / (np.sqrt(2 * np.pi) * blurred).prod(axis=2)
+            return np.asarray(peak * np.exp(-(off**2).sum(axis=2) / 2))
+
+        out += near(self.tracks.measured[is_target], APART).sum(axis=1)
         if told is not None:
-            others = told.select(~told.is_reference)
-            known += [(others.measured, others.std, 1.0)]
-        for places, std, share in known:
-            off = leeway.off(z[of.row, None] - places)
-            std = np.sqrt(std**2 + (of.std**2 + of.pull**2 / 3)[:, None])
-            peak = 1 / (np.sqrt(2 * np.pi) * std).prod(axis=2)
-            out += share * (peak * np.exp(-((off / std) ** 2).sum(axis=2) / 2)).sum(axis=1)
-        return np.asarray(out)
+            counts = self.fits_best(told) == of.row[:, None]
+            counts &= np.arange(len(told)) != of.report
+            out += (near(told.measured, told.std) * counts).sum(axis=1)
+        return out
+
+    def fits_best(self, told: TrackSet) -> np.ndarray:
+        """Return which track (S,) fits each UAV best that others report; -1: the reference."""
+        off = self.leeway.off(told.measured[:, None] - self.tracks.measured)
+        std = np.hypot(told.std[:, None], self.tracks.std)
+        cost = ((off / std) ** 2 + 2 * np.log(std)).sum(axis=2)
+        cost[:, self.tracks.is_reference] = np.inf
+        return np.where(told.is_reference, -1, cost.argmin(axis=1))
 
     def useful(self, told: TrackSet) -> np.ndarray:
         """Return which UAVs that others report (S,) may explain tracks."""
@@ -341,8 +345,7 @@ class _Held:
         return reflections(known.mean[s], start, self.own, self.walls, reach)
 
     def explained(self, known: TrackSet, s: int, single: np.ndarray | None) -> _Explained | None:
-        """Return which tracks are echoes of a source over walls by their measures; None if walls
-        show none of it."""
+        """Return which tracks are echoes of a source over walls by their measures; None: none."""
         shown, tracks, leeway = self.shown(known, s), self.tracks, self.leeway
         if not shown.faces.size:
             return None
@@ -363,8 +366,10 @@ class _Held:
             hit &= ~(single[:, None] & one_way & leeway.apart(shown.measured))
         row, path = np.nonzero(hit)
         of_pair = (a[row, path] for a in np.broadcast_arrays(off, std, pull))
-        source = int(known.ids[s])
-        return _Explained(row, source, shown.faces[path], shown.orders[path], *of_pair)
+        if not row.size:
+            return None
+        source, report = int(known.ids[s]), -1 if known is tracks else s
+        return _Explained(row, source, report, shown.faces[path], shown.orders[path], *of_pair)
 
 
 def alone(d: Detections, leeway: Leeway) -> np.ndarray:
@@ -454,7 +459,7 @@ def reflections(
     start = sender + here
     first, images, turned = _images(state + here, start, walls, reach)
     far, near = (measure(images, own, end) for end in (start, None))
-    slopes = (jacobian(images, own, start) - jacobian(images, own)) @ turned
+    slopes = -transmitter_jacobian(images, start) @ turned
     sent = np.concatenate([(far - near)[..., None], slopes], axis=2)
     faces = np.where(first >= 0, first, last[:, None]).T
     orders = (first >= 0)[:, None].astype(int) + (last >= 0)

@@ -65,12 +65,12 @@ class Talk:
     Attributes
     ----------
     channels : by way
-    known : by frame its time [s], and by terminal the UAVs that it knew of then
+    known : by frame its time [s], and by link the UAVs that its receiver knew of then from others
     records : of the swarm's UAVs, by name and active terminal
     """
 
     channels: dict[Link, Channel] = field(default_factory=dict)
-    known: dict[int, tuple[float, dict[str, list[ReportedUav]]]] = field(default_factory=dict)
+    known: dict[int, tuple[float, dict[Link, list[ReportedUav]]]] = field(default_factory=dict)
     records: dict[tuple[Name, Link], Record] = field(default_factory=dict)
 
 
@@ -127,8 +127,9 @@ class Cooperation(Stateful):
             for name, notes in self._notes.items()
         }
         views[SWARM] = View(time, self._existing(views[SWARM].fused, frame, poses, received))
+        links = self._setup.timetable.all_links
         known = self.state.known | {
-            frame: (time, {n: self._reported_uavs(n, views[n], time) for n in self._names})
+            frame: (time, {link: self._reported_uavs(link, views[link.rx], time) for link in links})
         }
         self.state.known = {k: v for k, v in known.items() if k > frame - PREFETCHED_FRAMES}
         self._send(frame)
@@ -152,27 +153,24 @@ class Cooperation(Stateful):
         g = predict(Track.of_state(state, self._acceleration).state, interval, self._acceleration)
         return Gaussian(g.mean[:6], g.covariance[:6, :6])
 
-    def _reported_uavs(self, name: str, view: View, time: float) -> list[ReportedUav]:
-        """Return the targets that a terminal knows of from others: other terminals by their
-        reports, and the fused tracks that are none of these."""
+    def _reported_uavs(self, link: Link, view: View, time: float) -> list[ReportedUav]:
+        """Return the targets that the receiver of a link knows of: other terminals by their reports
+        but the link's ends, and the fused tracks that are none of these but what the link alone
+        tracks."""
         terminals = [
             ReportedUav(other, self._coasted(s.state, time - s.time))
-            for other, s in self._notes[name].terminals.items()
+            for other, s in self._notes[link.rx].terminals.items()
+            if other not in link
         ]
-        own = {str(link) for link in self._setup.timetable.all_links if link.rx == name}
-        told = (b for b in view.fused if b.terminal is None)
-        return terminals + [
-            ReportedUav("", b.state) for b in told if {key.origin for key in b.members} - own
-        ]
+        others = (b for b in view.fused if {key.origin for key in b.members} - {str(link)})
+        return terminals + [ReportedUav("", b.state) for b in others if b.terminal is None]
 
     def reports(self, link: Link, frame: int, time: float) -> list[ReportedUav]:
-        """The UAVs that a link's receiver knew of after a frame, at a time [s], but the link's
-        ends; none where the frame is not remembered."""
+        """The UAVs that a link's receiver knew of after a frame, at a time [s]; none where the
+        frame is not remembered."""
         then, known = self.state.known.get(frame, (time, {}))
         return [
-            uav._replace(state=self._coasted(uav.state, time - then))
-            for uav in known.get(link.rx, [])
-            if uav.terminal not in link
+            uav._replace(state=self._coasted(uav.state, time - then)) for uav in known.get(link, [])
         ]
 
     def _existing(

@@ -168,8 +168,9 @@ def test_an_active_terminal_sees_three_echoes_and_an_image_in_each_wall():
 @pytest.mark.parametrize("sender", [BODY * 0, SENDER - HERE, None], ids=["own", "other", "alone"])
 def test_what_walls_show_is_as_uncertain_as_its_source(sender):
     """Slopes by differences over 2 mm and 2 mm/s (1e-6: third derivatives over the step, and the
-    rounding of lengths), at both kinds of terminal; a deviation along one axis is that slope's.
-    Planted bugs: motion not mirrored; the way to the body left out; one range for the mean."""
+    rounding of lengths), at both kinds of terminal; an error of all axes at once moves it as far as
+    it moves. Planted bugs: motion not mirrored; the way to the body left out; one range for the
+    mean; axes taken for independent."""
 
     def shown(state: np.ndarray) -> Paths:
         if sender is not None and not sender.any():
@@ -181,8 +182,10 @@ def test_what_walls_show_is_as_uncertain_as_its_source(sender):
     for axis, step in enumerate(1e-3 * np.eye(6)):
         slope = (shown(BODY - HERE + step).measured - shown(BODY - HERE - step).measured) / 2e-3
         np.testing.assert_allclose(found.slopes[..., axis], slope, rtol=0, atol=1e-6)
-        std = found.std(np.outer(step, step))
-        np.testing.assert_allclose(std, 1e-3 * np.abs(slope), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found.slopes[..., axis], slope, rtol=0, atol=1e-6)
+    way = 1e-3 * np.array([0.3, -0.8, 0.5, 0.9, 0.2, -0.6])  # errors that are one: correlated
+    off = (shown(BODY - HERE + way).measured - shown(BODY - HERE - way).measured) / 2
+    np.testing.assert_allclose(found.std(np.outer(way, way)), np.abs(off), rtol=0, atol=1e-8)
 
 
 def test_a_wall_between_two_is_no_mirror():
@@ -289,6 +292,19 @@ def test_a_ghost_is_farther_than_its_source():
     )
     found = asked([track(4, place, wide), track(5, other, wide)])
     assert found.source.tolist() == [-1, 4]
+
+
+@pytest.mark.parametrize(("share", "mirrored"), [(0.97, True), (1.03, False)])
+def test_two_waves_in_phase_are_four_times_as_strong_as_one(share, mirrored):
+    """The echo over the wall on one way beside its body at 50 over the noise, up to four times what
+    a wave over one segment has that is longer by twice its range less the direct one. Planted bugs:
+    the bound of one wave; none."""
+    echo = Track(9, track(9, before_the_wall(half_echo())).state, 1.0, confirmed=True)
+    direct, over = np.linalg.norm(BODY[:3] - HERE[:3]), half_echo()[0]
+    echo.snr = share * 4 * 50.0 * (direct / (2 * over - direct)) ** 2
+    body = track(4, BODY)
+    assert body.snr == 50.0
+    assert (asked([body, echo]).mirrored[1] >= 0) == mirrored
 
 
 @pytest.mark.parametrize("component", range(4))
