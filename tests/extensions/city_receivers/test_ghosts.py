@@ -206,9 +206,10 @@ def test_a_target_may_be_anywhere(period):
     """The image alone is tracked, and its body told: nothing else is near, so that one target in
     all ranges up to it, rates and directions of the array is held against the echo, by hand.
     Planted bugs: none anywhere; directions beyond the array's; the body itself a target there."""
-    image = track(5, BODY[:3] * [-1, 1, 1] + [2 * WALL_X, 0, 0], BODY[3:] * [-1, 1, 1])
+    place = np.array([WALL_X - 0.3, *BODY[1:3]])
+    image = track(5, place * [-1, 1, 1] + [2 * WALL_X, 0, 0], BODY[3:] * [-1, 1, 1])
     tracks = track_set([image], OWN)
-    body = Gaussian(np.concatenate([BODY[:3] + ORIGIN, BODY[3:]]), np.eye(6) * 1e-3)
+    body = Gaussian(np.concatenate([place + ORIGIN, BODY[3:]]), np.diag([0.04] * 3 + [0.01] * 3))
     told = track_set([Track.of_state(body)], OWN)
     leeway = Leeway(RESOLUTION, Ambiguity(PERIOD), period)
     found = suspicion(tracks, OWN, Walls(wall()), leeway, told, np.zeros(1, bool))
