@@ -36,8 +36,6 @@ STANDS_ODDS = 10.0
 it flies as UAVs do. What is not known of its velocity says nothing."""
 CROWD = 3
 """So many spots beside it that were not found again make an echo part of a surface."""
-SURFACE = 16
-"""So many spots beside a track are a surface, whether found again or not: a dozen UAVs are less."""
 FOUND_AGAIN = 0.5
 """Share of the frames since its first one in which a UAV is found."""
 STANDS_OUT = 10.0
@@ -88,14 +86,10 @@ class StaticClutter(TrackRule):
         return replace(detections, starts=detections.starts & ~self._crowd)
 
     def prune(self, tracker: Tracker, own: Ownship) -> None:
-        """End the tracks that are static within a crowd, and those, not reported before, that
-        an echo of one carries on: from beyond the view and along a wall they seem
-        to move. Few hits confirm no track beside a surface: chance carries it from spot to spot.
-        None is confirmed before the clutter is known."""
+        """End the tracks that are static within a crowd, and those, not reported before, that an
+        echo of one carries on: from beyond the view and along a wall they seem to move. None is
+        confirmed before the clutter is known."""
         for track in (t for t in tracker.tracks if t.id in own.tentative):
-            if track.confirmed and sum(track.recent) < tracker.settings.confirm_window:
-                beside = self._beside(track.state.mean[None, :3])
-                track.confirmed = int(beside.sum()) < SURFACE
             track.confirmed &= own.clutter_known  # else it may be an echo of the city
         fed = {t.id for t in tracker.tracks if t.detection >= 0 and self._crowd[t.detection]}
         still = {t.id for t in tracker.tracks if self.holds(t)}
