@@ -24,8 +24,9 @@ from __future__ import annotations
 
 from math import log
 
-BIRTH = log(1 / 6)
-"""Log-odds of a first detection: of ten that no rule refuses, one or two are of a new target."""
+BIRTH = {1: log(1 / 12), 2: log(1 / 6)}
+"""Log-odds of a first detection by the passes of the range: of ten that no rule refuses one is of a
+new target at a passive terminal, one or two at an active one."""
 RECURS = 0.1
 """p_A: share of the frames in which an artefact is found where its track expects it."""
 SURE = log(200)

@@ -325,7 +325,8 @@ class Tracker(Stateful):
             track.first_id = first.setdefault(q, track.id)
             track.last = self.state.time
             track.confirmed = s.confirm_hits == 1
-            track.odds = existence.BIRTH if self.by_odds else np.inf
+            if self.by_odds:
+                track.odds = existence.BIRTH[2 if transmitter is None else 1]
             self.tracks.append(track)
 
     def _condition(

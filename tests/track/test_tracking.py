@@ -535,3 +535,16 @@ def test_one_sure_detection_confirms_no_track(sure, frame, sender):
         if first is None and tracker.tracks[0].confirmed:
             first = n
     assert first == frame
+
+
+@pytest.mark.parametrize(("sender", "frame"), [(None, 1), (Gaussian(AT, 1e-4 * np.eye(6)), 2)])
+def test_fewer_first_detections_are_targets_at_a_passive_terminal(sender, frame):
+    """Detected in each frame, an active terminal's track is a target more probably than not from
+    the second one on, a passive one's from the third. Planted bug: the same odds at both."""
+    tracker = Tracker(Tracking(initiation="unexplained"), Ambiguity(np.inf, 0.0))
+    z, said = measure(BODY, OWN, None if sender is None else sender.mean), []
+    for n in range(4):
+        tracker.predict(1e-6 * n)
+        tracker.update(detections(z), OWN, sender)
+        said.append(tracker.tracks[0].credible)
+    assert said == [n >= frame for n in range(4)]
