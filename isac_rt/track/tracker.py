@@ -36,9 +36,8 @@ from isac_rt.track.settings import Tracking
 from isac_rt.world.swarm import Pose
 
 SURE_HITS = 2
-"""With `tracking.initiation: unexplained` a track is confirmed if so many of its detections could
-have started it: others pass a lower threshold, which strong clutter passes again and again. Odds
-decide the rest."""
+"""With `tracking.initiation: unexplained` odds confirm a track if so many of its detections could
+have started it: others pass a lower threshold, which strong clutter passes again and again."""
 CLEAR_M = 0.5
 """No two UAVs are nearer to each other, and none is to a wall [m]: their arms are as long."""
 ROUNDING = 1e-9

@@ -85,10 +85,6 @@ class ClockEstimate:
     def offset_std(self) -> float:
         return float(np.sqrt(self.covariance[0, 0]))
 
-    @property
-    def drift_std(self) -> float:
-        return float(np.sqrt(self.covariance[1, 1]))
-
     def offset_at(self, time: float) -> float:
         """Offset at another time [s]."""
         return self.offset + self.drift * (time - self.time)

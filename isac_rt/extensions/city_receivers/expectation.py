@@ -71,9 +71,6 @@ class MeshExpectation:
         self._city, self._arrays = city, arrays
         self._level = 10 ** (level_db / 20)  # factor of all amplitudes
 
-    def __len__(self) -> int:
-        return len(self._field.cells)
-
     def clutter(self, name: str, pose: Pose, time: float, amplitude: float) -> ExpectedClutter:
         """Return the clutter of the terminal's own link at a time, from where it believes to be.
 

@@ -78,32 +78,27 @@ class Ghosts(TrackRule):
 
     def __init__(self, walls: Walls, leeway: Leeway) -> None:
         self._walls, self._leeway = walls, leeway
-        self._alone = np.zeros(0, bool)
+        self._alone = np.zeros(1, bool)
 
     def candidates(self, detections: Detections, own: Ownship) -> Detections:
-        self._alone = alone(detections, self._leeway)
+        self._alone = np.append(alone(detections, self._leeway), False)  # without a detection
         return detections
 
     def prune(self, tracker: Tracker, own: Ownship) -> None:
         """Doubt the tracks that are a nearer target's echoes over a wall, of targets that others
         report too, and those that lie behind one, which is asked where they are first to be
         reported and where they pass one."""
-        credible = {t.id: t.state.mean[:3] for t in tracker.tracks if t.credible}
+        credible = [t for t in tracker.tracks if t.credible]
         if not credible:
             return
-        tracks = tracker.snapshot(own.pose, own.reference)
-        asked = {
-            number
-            for number, place in credible.items()
-            if number in own.tentative or self._walls.within(place, CROSSING_M)
-        }
+        tracks, walls = tracker.snapshot(own.pose, own.reference), self._walls
+        new = {t.id for t in credible if t.id in own.tentative}
+        passing = {t.id for t in credible if walls.within(t.state.mean[:3], CROSSING_M)}
+        rows = np.isin(tracks.ids, [*new, *passing]) & ~tracks.is_reference
         reports = [Track.of_state(target.state) for target in own.reports]
         others = track_set(reports, own.pose, own.reference)
-        single = (
-            (tracks.detection >= 0) & self._alone[tracks.detection] if self._alone.size else None
-        )
-        rows = np.isin(tracks.ids, [*asked]) & ~tracks.is_reference
-        said = suspicion(tracks, own.pose, self._walls, self._leeway, others, rows, single)
+        single = self._alone[tracks.detection]
+        said = suspicion(tracks, own.pose, walls, self._leeway, others, rows, single)
         tracker.doubt(dict(zip(tracks.ids.tolist(), said.ratio.tolist(), strict=True)))
 
 
@@ -221,14 +216,10 @@ def suspicion(
         np.full(count, np.inf),
     )
     held = _Held(tracks, own, walls, leeway)
+    ends = [own.position + to for to in ([0.0] if held.sender is None else [0.0, held.sender[:3]])]
     for k in np.flatnonzero(~tracks.is_reference if asked is None else asked):
-        out.behind[k] = occluded_by(
-            own.position + tracks.mean[k, :3],
-            tracks.covariance[k, :3, :3],
-            held.seen_from,
-            walls,
-            leeway.resolution[0],
-        )
+        place, P = own.position + tracks.mean[k, :3], tracks.covariance[k, :3, :3]
+        out.behind[k] = occluded_by(place, P, ends, walls, leeway.resolution[0])
     sources = [(tracks, int(s)) for s in np.flatnonzero(tracks.confirmed & (out.behind < 0))]
     if reported is not None:
         sources += [(reported, int(s)) for s in np.flatnonzero(held.useful(reported))]
@@ -289,12 +280,6 @@ class _Held:
         """(6,) of a passive terminal's transmitter, relative to the terminal."""
         is_reference = self.tracks.is_reference
         return self.tracks.mean[is_reference][0] if is_reference.any() else None
-
-    @property
-    def seen_from(self) -> list[np.ndarray]:
-        """Places of both ends."""
-        here = self.own.position
-        return [here] if self.sender is None else [here, here + self.sender[:3]]
 
     def density(self, of: _Explained, is_target: np.ndarray, told: TrackSet | None) -> np.ndarray:
         """Return how many targets (n,) there are by unit of range [m], rate [m/s] and direction
@@ -415,11 +400,6 @@ class Paths(NamedTuple):
         rate say little of decides what the ground shows."""
         return np.asarray(np.sqrt(((self.slopes @ covariance) * self.slopes).sum(axis=-1)))
 
-    @classmethod
-    def of(cls, faces: np.ndarray, orders: np.ndarray, found: np.ndarray) -> Paths:
-        """For measures with their slopes (P, 4, 7)."""
-        return cls(faces, orders, found[..., 0], found[..., 1:])
-
 
 def echoes(state: np.ndarray, own: Pose, walls: Walls, reach: float = np.inf) -> Paths:
     """Return a target's echoes over each single wall, four of each, images beyond `reach` [m] left
@@ -437,8 +417,8 @@ def echoes(state: np.ndarray, own: Pose, walls: Walls, reach: float = np.inf) ->
     direct = np.broadcast_to(seen[0], mirrored.shape)
     out = np.stack([direct, mirrored, middle, mirrored], axis=1)
     out[:, :3, :2] = middle[:, None, :2]
-    count = len(mirrored)
-    return Paths.of(np.repeat(faces[1:], 4), np.tile([1, 1, 1, 2], count), out.reshape(-1, 4, 7))
+    out, orders = out.reshape(-1, 4, 7), np.tile([1, 1, 1, 2], len(mirrored))
+    return Paths(np.repeat(faces[1:], 4), orders, out[..., 0], out[..., 1:])
 
 
 def reflections(
@@ -455,7 +435,7 @@ def reflections(
     last, images, turned = _images(state + here, here, walls, reach)
     seen = np.concatenate([measure(images, own)[..., None], jacobian(images, own) @ turned], axis=2)
     if sender is None:
-        return Paths.of(last[1:], np.ones(last.size - 1, int), seen[1:])
+        return Paths(last[1:], np.ones(last.size - 1, int), seen[1:, :, 0], seen[1:, :, 1:])
     start = sender + here
     first, images, turned = _images(state + here, start, walls, reach)
     far, near = (measure(images, own, end) for end in (start, None))
@@ -463,9 +443,8 @@ def reflections(
     sent = np.concatenate([(far - near)[..., None], slopes], axis=2)
     faces = np.where(first >= 0, first, last[:, None]).T
     orders = (first >= 0)[:, None].astype(int) + (last >= 0)
-    over = orders.ravel() > 0
-    found = (sent[:, None] + seen).reshape(-1, 4, 7)
-    return Paths.of(faces.ravel()[over], orders.ravel()[over], found[over])
+    out = (sent[:, None] + seen)[orders > 0]
+    return Paths(faces[orders > 0], orders[orders > 0], out[..., 0], out[..., 1:])
 
 
 def _images(
@@ -497,9 +476,7 @@ def occluded_by(
         for face in walls.blocking(start, place):
             n = walls.city.normals[face]
             depth = abs(n @ place - walls.city.plane_offsets[face] - n @ walls.city.origin)
-            if (
-                depth
-                > DEVIATIONS * np.sqrt(n @ covariance @ n) + RESOLUTION_SHARE * range_resolution
-            ):
+            spread = DEVIATIONS * np.sqrt(n @ covariance @ n)
+            if depth > spread + RESOLUTION_SHARE * range_resolution:
                 return int(face)
     return -1

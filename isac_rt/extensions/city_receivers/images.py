@@ -126,18 +126,13 @@ def _images(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Images (K, 6) of `start` (6,) that `end` (6,) sees, over mirrors that are near the one and
     the other, and the ways of their waves (K, 4, 3)."""
-    parts = _by_one(start, end, walls, near[1], reach), _by_two(start, end, walls, near, reach)
+    _, single, places = walls.images(start, end, reach, EDGE, near[1])
+    far = np.linalg.norm(single[:, :3] - end[:3], axis=1) > 2 * LEAST_RANGE
+    by_one = single[far], np.stack([places, places], axis=1)[far]
+    parts = by_one, _by_two(start, end, walls, near, reach)
     images, points = (np.concatenate(of) for of in zip(*parts, strict=True))
     first, last = (np.tile(of[:3], (len(images), 1, 1)) for of in (start, end))
     return images, np.concatenate([first, points, last], axis=1)
-
-
-def _by_one(
-    start: np.ndarray, end: np.ndarray, walls: Walls, near: np.ndarray, reach: float
-) -> tuple[np.ndarray, np.ndarray]:
-    _, images, places = walls.images(start, end, reach, EDGE, near)
-    far = np.linalg.norm(images[:, :3] - end[:3], axis=1) > 2 * LEAST_RANGE
-    return images[far], np.stack([places, places], axis=1)[far]
 
 
 def _by_two(

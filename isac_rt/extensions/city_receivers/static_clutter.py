@@ -130,11 +130,6 @@ class StaticClutter(TrackRule):
         self._note(place[some], d.select(some), own, time)
         return still & self.crowded(place, d.snr)
 
-    def _beside(self, places: np.ndarray) -> np.ndarray:
-        """Return which spots lie beside places (n, 3): (n, spots)."""
-        separation = np.linalg.norm(places[:, None] - self.state.spots[None, :, :3], axis=-1)
-        return np.asarray((separation > BESIDE_M[0]) & (separation < BESIDE_M[1]))
-
     def _note(self, places: np.ndarray, d: Detections, own: Pose, time: float) -> None:
         """Follow the spots to a frame's echoes at places (n, 3), within three deviations in
         direction."""
@@ -159,7 +154,9 @@ class StaticClutter(TrackRule):
         the foot of a wall shines too."""
         spots = self.state.spots
         fleeting = spots[:, 5] <= FOUND_AGAIN * (self.state.frames - spots[:, 6])
-        beside = self._beside(places) & (spots[:, 3] < STANDS_OUT * snr[:, None])
+        separation = np.linalg.norm(places[:, None] - spots[:, :3], axis=-1)
+        beside = (separation > BESIDE_M[0]) & (separation < BESIDE_M[1])
+        beside &= spots[:, 3] < STANDS_OUT * snr[:, None]
         like = beside & (STANDS_OUT * spots[:, 3] > snr[:, None])
 
         def is_surface(some: np.ndarray) -> np.ndarray:

@@ -10,8 +10,7 @@ import pytest
 from isac_rt.extensions.city_receivers.images import (
     Images,
     Ways,
-    _by_one,
-    _by_two,
+    _images,
 )
 from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas
@@ -198,12 +197,7 @@ def test_all_ways_over_one_and_two_planes_are_found():
         ]
         if far[0] is not None:
             expected.append([far[0], (far[2] - far[1]) / 2e-4])
-    found = np.concatenate(
-        [
-            measure(one(sender, here, walls, near_ends, 500.0)[0], own)[:, :2]
-            for one, near_ends in ((_by_one, near), (_by_two, (near, near)))
-        ]
-    )
+    found = measure(_images(sender, here, walls, (near, near), 500.0)[0], own)[:, :2]
     assert len(found) > 40
     np.testing.assert_allclose(unique(found), unique(np.array(expected)), rtol=0, atol=1e-6)
 
