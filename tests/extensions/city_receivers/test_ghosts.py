@@ -57,6 +57,15 @@ def wall() -> CityMesh:
     )
 
 
+TURNED = np.array([-1, 1, 1])
+"""What the wall makes of a velocity."""
+
+
+def image_of(place: np.ndarray) -> np.ndarray:
+    """The image of a local place in the wall."""
+    return place * TURNED + [2 * WALL_X, 0, 0]
+
+
 def track(number: int, place: np.ndarray, velocity: np.ndarray) -> Track:
     """A confirmed track at a local place, known to a few centimetres and decimetres per second."""
     state = Gaussian(np.concatenate([place + ORIGIN, velocity]), np.diag([4e-4] * 3 + [1e-2] * 3))
@@ -129,8 +138,8 @@ def test_ghosts_are_suspected_and_bodies_are_not():
     before the wall), and another body of the same range and rate as that echo but elsewhere.
     Planted bugs: directions not compared; only the image looked for."""
     body, own = BODY[:3], OWN.position - ORIGIN
-    image = body * [-1, 1, 1] + [2 * WALL_X, 0, 0]
-    image_velocity = BODY[3:] * [-1, 1, 1]
+    image = image_of(body)
+    image_velocity = BODY[3:] * TURNED
     mean = (np.linalg.norm(body - own) + np.linalg.norm(image - own)) / 2
     ahead = (body - own) / np.linalg.norm(body - own)
     half = own + mean * ahead
@@ -166,10 +175,10 @@ def test_an_echo_over_a_wall_is_weaker_than_its_source(share, mirrored):
     whose power it does not tell. Planted bugs: the power not asked; once a wave; the fourth power
     of the direct segment; reports of UAVs that are tracked."""
     body, own = BODY[:3], OWN.position - ORIGIN
-    image = body * [-1, 1, 1] + [2 * WALL_X, 0, 0]
+    image = image_of(body)
     near, far = (float(np.linalg.norm(p - own)) for p in (body, image))
     brightest = 2 * 50.0 * (near / (2 * far - near)) ** 2
-    seen = track(5, image, BODY[3:] * [-1, 1, 1])
+    seen = track(5, image, BODY[3:] * TURNED)
     seen.snr = share * brightest
     tracks = track_set([track(3, body, BODY[3:]), seen], OWN)
     asked = np.zeros(2, bool)  # only of the image
@@ -186,7 +195,7 @@ def test_bodies_that_others_know_of_explain_echoes():
     Told 2 m of doubt it explains nothing, and a track of the body is no echo of it though one more
     body is told beside it. Planted bugs: any told body counts; the body's own track among the
     suspected."""
-    image = track(5, BODY[:3] * [-1, 1, 1] + [2 * WALL_X, 0, 0], BODY[3:] * [-1, 1, 1])
+    image = track(5, image_of(BODY[:3]), BODY[3:] * TURNED)
     tracks = track_set([image], OWN)
     nobody = np.zeros(1, bool)
     for spread, expected in ((1e-3, 2), (4.0, 0)):
@@ -207,7 +216,7 @@ def test_a_target_may_be_anywhere(period):
     all ranges up to it, rates and directions of the array is held against the echo, by hand.
     Planted bugs: none anywhere; directions beyond the array's; the body itself a target there."""
     place = np.array([WALL_X - 0.3, *BODY[1:3]])
-    image = track(5, place * [-1, 1, 1] + [2 * WALL_X, 0, 0], BODY[3:] * [-1, 1, 1])
+    image = track(5, image_of(place), BODY[3:] * TURNED)
     tracks = track_set([image], OWN)
     body = Gaussian(np.concatenate([place + ORIGIN, BODY[3:]]), np.diag([0.04] * 3 + [0.01] * 3))
     told = track_set([Track.of_state(body)], OWN)
@@ -298,10 +307,10 @@ def test_a_track_averages_what_pulls_it(age, expected):
     """The image 0.19 m too far, where half a cell is 0.125 m and three deviations 0.11 m: the pull
     of one frame, not the mean of nine. Planted bugs: the age left out; deviations averaged too."""
     body = BODY[:3]
-    image = body * [-1, 1, 1] + [2 * WALL_X, 0, 0]
+    image = image_of(body)
     own = OWN.position - ORIGIN
     far = image + 0.19 * (image - own) / np.linalg.norm(image - own)
-    seen = track(5, far, BODY[3:] * [-1, 1, 1])
+    seen = track(5, far, BODY[3:] * TURNED)
     seen.age = age
     tracks = track_set([track(3, body, BODY[3:]), seen], OWN)
     leeway = Leeway(RESOLUTION, Ambiguity(PERIOD))
@@ -323,8 +332,8 @@ def test_a_target_among_others_is_likelier_than_an_echo(board):
     that an array does not observe says next to nothing. Three of ten echoes are found, and the
     body's deviations are 1.5 times as large. Planted bugs: a track counts for itself; tracks behind
     walls, or tentative, are targets; no blur; pull taken for a deviation; none anywhere."""
-    body, image = BODY[:3], BODY[:3] * [-1, 1, 1] + [2 * WALL_X, 0, 0]
-    own, back = OWN.position - ORIGIN, BODY[3:] * [-1, 1, 1]
+    body, image = BODY[:3], image_of(BODY[:3])
+    own, back = OWN.position - ORIGIN, BODY[3:] * TURNED
     along = (image - own) / np.linalg.norm(image - own)
     everyone = [
         track(3, body, BODY[3:]),
@@ -358,12 +367,12 @@ def test_what_others_report_is_a_target(spread):
     """A report of a UAV where the body's image is: its density is added, by hand, as wide as report
     and track are; one of 3 m beside adds nothing, nor one of the body, however wide. Planted bugs:
     reports left out; as wide as neighbours or as what walls show; a report counts for all."""
-    body, image = BODY[:3], BODY[:3] * [-1, 1, 1] + [2 * WALL_X, 0, 0]
-    tracks = track_set([track(3, body, BODY[3:]), track(5, image, BODY[3:] * [-1, 1, 1])], OWN)
+    body, image = BODY[:3], image_of(BODY[:3])
+    tracks = track_set([track(3, body, BODY[3:]), track(5, image, BODY[3:] * TURNED)], OWN)
     leeway, none = Leeway(RESOLUTION, Ambiguity(PERIOD)), np.zeros(2, bool)
 
     def reported(place: np.ndarray, spread: float = spread) -> TrackSet:
-        state = np.concatenate([place + ORIGIN, BODY[3:] * [-1, 1, 1]])
+        state = np.concatenate([place + ORIGIN, BODY[3:] * TURNED])
         return track_set([Track.of_state(Gaussian(state, spread**2 * np.eye(6)))], OWN)
 
     def ratio(place: np.ndarray) -> float:
@@ -387,7 +396,7 @@ def test_images_of_a_formation_are_no_targets():
     step = np.array([0.9, 2.0, 0.3, 0, 0, 0])
     rows = [BODY + k * step for k in range(-2, 3)]
     there = [track(k, b[:3], b[3:]) for k, b in enumerate(rows)]
-    images = [b * [-1, 1, 1, -1, 1, 1] + [2 * WALL_X, 0, 0, 0, 0, 0] for b in rows]
+    images = [np.append(image_of(b[:3]), b[3:] * TURNED) for b in rows]
     seen = [replace(track(10 + k, b[:3], b[3:]), snr=10.0) for k, b in enumerate(images)]
     tracks = track_set(there + seen, OWN)
     nobody = np.zeros(10, bool)
@@ -397,10 +406,10 @@ def test_images_of_a_formation_are_no_targets():
 
 def test_the_likeliest_source_counts():
     """Of two that explain an echo, the one that it fits. Planted bug: the first."""
-    body, image = BODY[:3], BODY[:3] * [-1, 1, 1] + [2 * WALL_X, 0, 0]
+    body, image = BODY[:3], image_of(BODY[:3])
     off = body + np.array([0.0, 0.1, 0.0])
     tracks = [track(3, off, BODY[3:]), track(4, body, BODY[3:])]
-    tracks.append(track(5, image, BODY[3:] * [-1, 1, 1]))
+    tracks.append(track(5, image, BODY[3:] * TURNED))
     for order in ([0, 1, 2], [1, 0, 2]):
         some = track_set([tracks[k] for k in order], OWN)
         leeway = Leeway(RESOLUTION, Ambiguity(PERIOD))
@@ -451,12 +460,12 @@ def test_an_echo_is_doubted_once_its_body_is_known():
     second frame that knows of it, nor is it later without: it lies behind the wall. A frame that
     does not show it says nothing. Planted bugs: only new tracks asked; doubted without a
     detection."""
-    image = BODY[:3] * [-1, 1, 1] + [2 * WALL_X, 0, 0]
+    image = image_of(BODY[:3])
     w = Waveform()
     antennas = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
     body = [Gaussian(np.concatenate([BODY[:3] + ORIGIN, BODY[3:]]), np.eye(6) * 1e-4)]
     tracker = Tracker(Tracking(), Ambiguity(PERIOD))
-    one = track(5, image, BODY[3:] * [-1, 1, 1])
+    one = track(5, image, BODY[3:] * TURNED)
     one.odds, one.age, one.hits = existence.SURE, 20, 20
     tracker.state.tracks = [one]
     ghosts = Ghosts(Walls(wall()), Leeway.of(w, antennas, 2))
