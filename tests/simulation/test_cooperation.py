@@ -240,6 +240,21 @@ def test_what_the_at_should_see_and_has_not_is_no_uav():
     assert step([alone, sharper], 3, poses, {Link("AT", "AT"): seen}) == (sharper,)
 
 
+def test_what_no_active_terminal_lights_is_no_uav():
+    """UAVs of the PT alone beside the target and behind the AT, in a frame that the AT skips: the
+    second is none, unless the AT tracks it too or it is a terminal. Planted bugs: only links that
+    received asked; tracks of the AT's asked; terminals asked."""
+    exchange = Cooperation(prepare(scenario()))
+    poses, skipped = exchange._setup.swarm.poses(0.05), {Link("AT", "PT"): SimpleNamespace()}
+    of_pt, of_at = Key("AT->PT", 4), Key("AT->AT", 2)
+    before, behind = (Gaussian(np.array([9.0, y, 51.0, 0, 0, 0]), np.eye(6)) for y in (19.0, -15.0))
+    lit = Fused(Name(0.0, *of_pt), before, (of_pt,))
+    unlit = replace(lit, state=behind)
+    assert exchange._existing([lit, unlit], 3, poses, skipped) == (lit,)
+    for kept in (replace(unlit, members=(of_pt, of_at)), replace(unlit, terminal="PT")):
+        assert exchange._existing([kept], 3, poses, skipped) == (kept,)
+
+
 def test_a_terminal_does_not_report_its_own_tracks_to_itself():
     """UAVs by its own tracks, by another's and by both; one that is a terminal. Planted bug: what
     it tracks alone comes back as a report."""

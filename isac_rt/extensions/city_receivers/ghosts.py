@@ -223,7 +223,7 @@ def suspicion(
     sources = [(tracks, int(s)) for s in np.flatnonzero(tracks.confirmed & (out.behind < 0))]
     if reported is not None:
         sources += [(reported, int(s)) for s in np.flatnonzero(held.useful(reported))]
-    found = [of for known, s in sources if (of := held.explained(known, s, single))]
+    found = [of for known, s in sources if (of := held.explained(known, s, single)).row.size]
     is_target = tracks.confirmed & ~tracks.is_reference & (out.behind < 0)
     for of in found:
         is_target[of.row] = False
@@ -329,11 +329,9 @@ class _Held:
         start = None if known.is_reference[s] else self.sender
         return reflections(known.mean[s], start, self.own, self.walls, reach)
 
-    def explained(self, known: TrackSet, s: int, single: np.ndarray | None) -> _Explained | None:
-        """Return which tracks are echoes of a source over walls by their measures; None: none."""
+    def explained(self, known: TrackSet, s: int, single: np.ndarray | None) -> _Explained:
+        """Return which tracks are echoes of a source over walls by their measures."""
         shown, tracks, leeway = self.shown(known, s), self.tracks, self.leeway
-        if not shown.faces.size:
-            return None
         std = np.hypot(tracks.std, known.std[s])
         one_way = (shown.orders == 1) & (self.sender is None)
         may_be = ~tracks.is_reference & (tracks.range > known.range[s])
@@ -351,8 +349,6 @@ class _Held:
             hit &= ~(single[:, None] & one_way & leeway.apart(shown.measured))
         row, path = np.nonzero(hit)
         of_pair = (a[row, path] for a in np.broadcast_arrays(off, std, pull))
-        if not row.size:
-            return None
         source, report = int(known.ids[s]), -1 if known is tracks else s
         return _Explained(row, source, report, shown.faces[path], shown.orders[path], *of_pair)
 

@@ -90,10 +90,10 @@ class OutOfSequence(OtherPaths):
         maps: bool,
     ) -> tuple[Reception, bool]:
         self.late = ()
-        if anchored:
-            self.search(cube, own.time)
-            if refused:
-                self.start(delayed(reception.detections, own.clock), own.time)
+        if anchored and self.state.batch:  # it tells the whole cells of those that wait
+            self.state.path = self._learn(cube, own.time, False) or self.state.path
+        if anchored and refused:
+            self.start(delayed(reception.detections, own.clock), own.time)
         if reception.line_of_sight:
             self.forget()
         if anchored or reception.decoded:
@@ -136,11 +136,6 @@ class OutOfSequence(OtherPaths):
             self.state.path = self._learn(cube, time, True)
             out = self._over(cube, time, hints, maps=maps)
         return out
-
-    def search(self, cube: IFCube, time: float) -> None:
-        """A frame without data, which tells the whole cells of those that wait."""
-        if self.state.batch:
-            self.state.path = self._learn(cube, time, False) or self.state.path
 
     def take_over(self, reference: Prediction, own: Ownship) -> None:
         p = delayed(reference, own.clock)
@@ -208,9 +203,8 @@ class OutOfSequence(OtherPaths):
         path = self.state.path
         assert path is not None
         off = np.abs(np.stack([d.range, d.velocity]).T - path.mean[:2])
-        gate = np.maximum(
-            GATE_CELLS * self._cells, GATE_STDS * np.sqrt(np.diag(path.covariance)[:2])
-        )
+        std = np.sqrt(np.diag(path.covariance)[:2])
+        gate = np.maximum(GATE_CELLS * self._cells, GATE_STDS * std)
         # zero on an axis that is not seen
         aside = folded(np.nan_to_num(d.direction - path.direction), self._leeway.cosine_period)
         near = (off < gate).all(axis=1) & (np.abs(aside) < self._beam).all(axis=1)

@@ -180,10 +180,9 @@ class Cooperation(Stateful):
         poses: Mapping[str, Pose],
         received: Mapping[Link, LinkResult],
     ) -> tuple[Fused, ...]:
-        """Return the swarm's UAVs without those that active terminals should have detected and did
-        not. A passive terminal's errors near the line of sight and over unknown paths are larger
-        than it knows: most tracks that it has alone are doubles of one that an active terminal has
-        elsewhere."""
+        """Return the swarm's UAVs without those of passive terminals that no active one lights, or
+        should have detected and did not. Errors near the line of sight and over unknown paths are
+        larger than known: most of these are doubles of one that an active terminal has."""
         records, odds = self.state.records, {uav.name: 0.0 for uav in fused}
         for link in received:
             if not link.own:
@@ -200,7 +199,13 @@ class Cooperation(Stateful):
         for (name, _), record in records.items():
             odds[name] += record.odds
         self.state.records = records
-        return tuple(uav for uav in fused if uav.terminal or odds[uav.name] >= 0)
+        lights = [Link(n, n) for n in self._setup.timetable.with_role("active", frame)]
+
+        def is_lit(uav: Fused) -> bool:
+            origins, place = {key.origin for key in uav.members}, uav.state.mean[:3]
+            return any(str(at) in origins or self._sees(at, place, poses) for at in lights)
+
+        return tuple(u for u in fused if u.terminal or (odds[u.name] >= 0 and is_lit(u)))
 
     def _hits(
         self, fused: Sequence[Fused], link: Link, received: LinkResult, own: Pose
@@ -226,10 +231,9 @@ class Cooperation(Stateful):
         s, pose = self._setup.of(link.tx), poses[link.rx]
         w, antennas = s.waveform, s.arrays.of(link.rx)
         distance = float(np.linalg.norm(place - pose.position))
-        towards = pose.to_body((place - pose.position) / distance)
-        far = distance > w.num_range_cells * w.range_cell(2)
-        if far or not antennas.in_view(towards) or s.walls.blocking(pose.position, place).size:
+        if distance > w.num_range_cells * w.range_cell(2) or not self._sees(link, place, poses):
             return 0.0
+        towards = pose.to_body((place - pose.position) / distance)
         section = 10 ** (SMALL_MEAN_DBSM / 10)
         amplitude = radar_amplitude(w.wavelength, section, distance, distance)
         sent, noise = s.transmission(link.tx, frame, pose), s.noise_power(dict(poses), link)
@@ -239,6 +243,14 @@ class Cooperation(Stateful):
         return sees.clutter_free(
             float((amplitude * antennas.element_gain(towards)) ** 2 * sees.cell)
         )
+
+    def _sees(self, link: Link, place: np.ndarray, poses: Mapping[str, Pose]) -> bool:
+        """Return whether a place is in an active terminal's field of view and not occluded."""
+        s, pose = self._setup.of(link.tx), poses[link.rx]
+        towards = (place - pose.position) / np.linalg.norm(place - pose.position)
+        if not s.arrays.of(link.rx).in_view(pose.to_body(towards)):
+            return False
+        return not s.walls.blocking(pose.position, place).size
 
     def _observe(self, frame: int, link: Link, received: LinkResult) -> None:
         """A terminal takes down what the tracks of one of its links detected."""

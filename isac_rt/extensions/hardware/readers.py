@@ -499,12 +499,6 @@ def waveform_described(d: Description) -> Waveform:
     )
 
 
-def _single(chirps: np.ndarray) -> np.ndarray:
-    """In single precision; what overflows is infinite, which is refused later."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.ascontiguousarray(chirps, np.complex64)
-
-
 def _capture(
     file: Path, d: Description, chirps: np.ndarray, antennas: Antennas | None, kind: str
 ) -> Capture:
@@ -512,8 +506,10 @@ def _capture(
     if antennas is not None:
         _same(file, "receivers", chirps.shape[1], antennas.num_rx)
         _same(file, "transmitters", d.num_tx, antennas.num_tx)
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite numbers are refused later
+        samples = np.ascontiguousarray(chirps, np.complex64)
     cube = IFCube(
-        samples=_single(chirps),
+        samples=samples,
         waveform=waveform_described(d),
         schedule=np.tile(np.array(d.chirps, np.int64), d.loops)[None],
         start_time=0.0,
