@@ -170,14 +170,14 @@ class StaticClutter(TrackRule):
         return out
 
     def holds(self, track: Track) -> bool:
-        """Return whether a track is static within a crowd, or flies where no UAV can, in a face. A
+        """Return whether a track is static within a crowd, or where no UAV can be, in a face. A
         confirmed one that was found in each of the latest frames is no passing spot."""
-        place = track.state.mean[:3]
-        if rests(track):
-            again = track.confirmed and all(track.recent)
-            return not again and bool(self.crowded(place[None], np.array([track.snr]))[0])
-        spread = float(np.sqrt(np.linalg.eigvalsh(track.state.covariance[:3, :3])[-1]))
-        return self._walls is not None and self._walls.within(place, CLEAR_M - 2 * spread)
+        place, P = track.state.mean[:3], track.state.covariance[:3, :3]
+        clear = CLEAR_M - 2 * float(np.sqrt(np.linalg.eigvalsh(P)[-1]))
+        if self._walls is not None and self._walls.within(place, clear):
+            return True
+        passing = rests(track) and not (track.confirmed and all(track.recent))
+        return passing and bool(self.crowded(place[None], np.array([track.snr]))[0])
 
 
 def rests(track: Track) -> bool:
