@@ -25,8 +25,8 @@ from __future__ import annotations
 from math import log
 
 BIRTH = {1: log(1 / 12), 2: log(1 / 6)}
-"""Log-odds of a first detection by the passes of the range: of ten that no rule refuses one is of a
-new target at a passive terminal, one or two at an active one."""
+"""Log-odds of a first detection by the passes of the range: of those that no rule refuses one of
+thirteen is of a new target at a passive terminal, one of seven at an active one."""
 RECURS = 0.1
 """p_A: share of the frames in which an artefact is found where its track expects it."""
 SURE = log(200)

@@ -255,6 +255,18 @@ def test_what_no_active_terminal_lights_is_no_uav():
         assert exchange._existing([kept], 3, poses, skipped) == (kept,)
 
 
+@pytest.mark.parametrize(("spread", "kept"), [(0.2, False), (3.0, True)])
+def test_what_may_be_before_a_wall_may_be_lit(spread, kept):
+    """A UAV of the PT alone 5 m within a house of the street, known well or not. Planted bugs: its
+    place without what it may be off; walls that hide nothing."""
+    exchange = Cooperation(prepare(load(SCENES / "street_canyon.yaml", ["cooperation=tracks"])))
+    of_pt = Key("AT->PT1", 4)
+    inside = Gaussian(np.array([-15.0, 5.0, 10.0, 0, 0, 0]), spread**2 * np.eye(6))
+    uav = Fused(Name(0.0, *of_pt), inside, (of_pt,))
+    poses, skipped = exchange._setup.swarm.poses(0.1), {Link("AT", "PT1"): SimpleNamespace()}
+    assert exchange._existing([uav], 3, poses, skipped) == ((uav,) if kept else ())
+
+
 def test_a_terminal_does_not_report_its_own_tracks_to_itself():
     """UAVs by its own tracks, by another's and by both; one that is a terminal. Planted bug: what
     it tracks alone comes back as a report."""

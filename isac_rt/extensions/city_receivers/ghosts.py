@@ -95,8 +95,7 @@ class Ghosts(TrackRule):
         new = {t.id for t in credible if t.id in own.tentative}
         passing = {t.id for t in credible if walls.within(t.state.mean[:3], CROSSING_M)}
         rows = np.isin(tracks.ids, [*new, *passing]) & ~tracks.is_reference
-        reports = [Track.of_state(target.state) for target in own.reports]
-        others = track_set(reports, own.pose, own.reference)
+        others = track_set([Track.of_state(u.state) for u in own.reports], own.pose, own.reference)
         single = self._alone[tracks.detection]
         said = suspicion(tracks, own.pose, walls, self._leeway, others, rows, single)
         tracker.doubt(dict(zip(tracks.ids.tolist(), said.ratio.tolist(), strict=True)))

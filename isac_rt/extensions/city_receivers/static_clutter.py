@@ -86,8 +86,8 @@ class StaticClutter(TrackRule):
         return replace(detections, starts=detections.starts & ~self._crowd)
 
     def prune(self, tracker: Tracker, own: Ownship) -> None:
-        """End the tracks that are static within a crowd, and those, not reported before, that an
-        echo of one carries on: from beyond the view and along a wall they seem to move. None is
+        """End the tracks in a face or static within a crowd, and those, not reported before, that
+        an echo of one carries on: from beyond the view and along a wall they seem to move. None is
         confirmed before the clutter is known."""
         for track in (t for t in tracker.tracks if t.id in own.tentative):
             track.confirmed &= own.clutter_known  # else it may be an echo of the city
@@ -174,10 +174,9 @@ class StaticClutter(TrackRule):
         confirmed one that was found in each of the latest frames is no passing spot."""
         place, P = track.state.mean[:3], track.state.covariance[:3, :3]
         clear = CLEAR_M - 2 * float(np.sqrt(np.linalg.eigvalsh(P)[-1]))
-        if self._walls is not None and self._walls.within(place, clear):
-            return True
+        in_face = self._walls is not None and self._walls.within(place, clear)
         passing = rests(track) and not (track.confirmed and all(track.recent))
-        return passing and bool(self.crowded(place[None], np.array([track.snr]))[0])
+        return in_face or (passing and bool(self.crowded(place[None], np.array([track.snr]))[0]))
 
 
 def rests(track: Track) -> bool:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from isac_rt.extensions.city_receivers.ghosts import occluded_by
 from isac_rt.extensions.cooperation.fusion import JOIN_PROBABILITY, Detection, FusedTracks
 from isac_rt.extensions.cooperation.messages import CODE_RATE, CORRECTED, Channel, Notes, SelfReport
 from isac_rt.frame.link import Link
@@ -154,9 +155,8 @@ class Cooperation(Stateful):
         return Gaussian(g.mean[:6], g.covariance[:6, :6])
 
     def _reported_uavs(self, link: Link, view: View, time: float) -> list[ReportedUav]:
-        """Return the targets that the receiver of a link knows of: other terminals by their reports
-        but the link's ends, and the fused tracks that are none of these but what the link alone
-        tracks."""
+        """Return the targets that the receiver of a link knows of from others: terminals but its
+        ends, by their reports, and fused tracks that are none of these nor of this link alone."""
         terminals = [
             ReportedUav(other, self._coasted(s.state, time - s.time))
             for other, s in self._notes[link.rx].terminals.items()
@@ -180,9 +180,9 @@ class Cooperation(Stateful):
         poses: Mapping[str, Pose],
         received: Mapping[Link, LinkResult],
     ) -> tuple[Fused, ...]:
-        """Return the swarm's UAVs without those of passive terminals that no active one lights, or
-        should have detected and did not. Errors near the line of sight and over unknown paths are
-        larger than known: most of these are doubles of one that an active terminal has."""
+        """Return the swarm's UAVs without those that active terminals should have detected and did
+        not, and those of passive terminals alone that none lights. Errors near the line of sight
+        and over unknown paths are larger than known: most of these are doubles of another."""
         records, odds = self.state.records, {uav.name: 0.0 for uav in fused}
         for link in received:
             if not link.own:
@@ -199,11 +199,12 @@ class Cooperation(Stateful):
         for (name, _), record in records.items():
             odds[name] += record.odds
         self.state.records = records
-        lights = [Link(n, n) for n in self._setup.timetable.with_role("active", frame)]
+        own = {str(link) for link in self._setup.timetable.all_links if link.own}
+        active = self._setup.timetable.with_role("active", frame)
 
         def is_lit(uav: Fused) -> bool:
-            origins, place = {key.origin for key in uav.members}, uav.state.mean[:3]
-            return any(str(at) in origins or self._sees(at, place, poses) for at in lights)
+            by_active = not own.isdisjoint(key.origin for key in uav.members)
+            return by_active or any(self._lights(name, uav, poses[name]) for name in active)
 
         return tuple(u for u in fused if u.terminal or (odds[u.name] >= 0 and is_lit(u)))
 
@@ -231,9 +232,10 @@ class Cooperation(Stateful):
         s, pose = self._setup.of(link.tx), poses[link.rx]
         w, antennas = s.waveform, s.arrays.of(link.rx)
         distance = float(np.linalg.norm(place - pose.position))
-        if distance > w.num_range_cells * w.range_cell(2) or not self._sees(link, place, poses):
-            return 0.0
         towards = pose.to_body((place - pose.position) / distance)
+        far = distance > w.num_range_cells * w.range_cell(2)
+        if far or not antennas.in_view(towards) or s.walls.blocking(pose.position, place).size:
+            return 0.0
         section = 10 ** (SMALL_MEAN_DBSM / 10)
         amplitude = radar_amplitude(w.wavelength, section, distance, distance)
         sent, noise = s.transmission(link.tx, frame, pose), s.noise_power(dict(poses), link)
@@ -244,13 +246,13 @@ class Cooperation(Stateful):
             float((amplitude * antennas.element_gain(towards)) ** 2 * sees.cell)
         )
 
-    def _sees(self, link: Link, place: np.ndarray, poses: Mapping[str, Pose]) -> bool:
-        """Return whether a place is in an active terminal's field of view and not occluded."""
-        s, pose = self._setup.of(link.tx), poses[link.rx]
+    def _lights(self, name: str, uav: Fused, pose: Pose) -> bool:
+        """Return whether an active terminal sends towards a UAV, and no wall hides its place."""
+        s, place = self._setup.of(name), uav.state.mean[:3]
         towards = (place - pose.position) / np.linalg.norm(place - pose.position)
-        if not s.arrays.of(link.rx).in_view(pose.to_body(towards)):
-            return False
-        return not s.walls.blocking(pose.position, place).size
+        sends = s.arrays.of(name).element_gain(pose.to_body(towards)) > 0
+        P, cell = uav.state.covariance[:3, :3], s.waveform.range_cell(2)
+        return bool(sends) and occluded_by(place, P, [pose.position], s.walls, cell) < 0
 
     def _observe(self, frame: int, link: Link, received: LinkResult) -> None:
         """A terminal takes down what the tracks of one of its links detected."""
