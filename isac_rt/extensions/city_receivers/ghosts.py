@@ -147,8 +147,7 @@ class Leeway:
         return np.asarray((np.abs(off) <= DEVIATIONS * std + pull).all(axis=-1))
 
     def apart(self, paths: np.ndarray) -> np.ndarray:
-        """(P,) whether the array tells the two waves of an echo over a wall on one way apart, of
-        `echoes` (P, 4)."""
+        """(P,) whether the array tells the two waves of `echoes` (P, 4) on one way apart."""
         off = np.abs(self.off(paths[3::4] - paths[0::4]))[:, 2:] > self.resolution[2:]
         return np.repeat((off & self.tells).any(axis=1), 4)
 

@@ -65,9 +65,7 @@ class OutOfSequence(OtherPaths):
     late : earlier frames that the last one made readable
     """
 
-    def __init__(
-        self, receiver: PassiveReceiver, waveform: Waveform, walls: Walls | None = None
-    ) -> None:
+    def __init__(self, receiver: PassiveReceiver, waveform: Waveform, walls: Walls | None) -> None:
         self._receiver, self._waveform, self._walls = receiver, waveform, walls
         self._leeway = Leeway.of(waveform, receiver.antennas, 1)
         self._cells, self._beam = np.split(self._leeway.resolution, 2)

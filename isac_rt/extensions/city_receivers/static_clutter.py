@@ -36,6 +36,8 @@ STANDS_ODDS = 10.0
 it flies as UAVs do. What is not known of its velocity says nothing."""
 CROWD = 3
 """So many spots beside it that were not found again make an echo part of a surface."""
+SURFACE = 16
+"""So many spots beside a track are a surface, whether found again or not: a dozen UAVs are less."""
 FOUND_AGAIN = 0.5
 """Share of the frames since its first one in which a UAV is found."""
 STANDS_OUT = 10.0
@@ -87,9 +89,11 @@ class StaticClutter(TrackRule):
 
     def prune(self, tracker: Tracker, own: Ownship) -> None:
         """End the tracks in a face or static within a crowd, and those, not reported before, that
-        an echo of one carries on: from beyond the view and along a wall they seem to move. None is
-        confirmed before the clutter is known."""
+        an echo of one carries on: from beyond the view and along a wall they seem to move. Few hits
+        confirm none beside a surface, whose spots carry it on, nor before the clutter is known."""
         for track in (t for t in tracker.tracks if t.id in own.tentative):
+            if track.confirmed and sum(track.recent) < tracker.settings.confirm_window:
+                track.confirmed = int(self._beside(track.state.mean[None, :3]).sum()) < SURFACE
             track.confirmed &= own.clutter_known  # else it may be an echo of the city
         fed = {t.id for t in tracker.tracks if t.detection >= 0 and self._crowd[t.detection]}
         still = {t.id for t in tracker.tracks if self.holds(t)}
@@ -130,6 +134,11 @@ class StaticClutter(TrackRule):
         self._note(place[some], d.select(some), own, time)
         return still & self.crowded(place, d.snr)
 
+    def _beside(self, places: np.ndarray) -> np.ndarray:
+        """Return which spots lie beside places (n, 3): (n, spots)."""
+        separation = np.linalg.norm(places[:, None] - self.state.spots[None, :, :3], axis=-1)
+        return np.asarray((separation > BESIDE_M[0]) & (separation < BESIDE_M[1]))
+
     def _note(self, places: np.ndarray, d: Detections, own: Pose, time: float) -> None:
         """Follow the spots to a frame's echoes at places (n, 3), within three deviations in
         direction."""
@@ -154,9 +163,7 @@ class StaticClutter(TrackRule):
         the foot of a wall shines too."""
         spots = self.state.spots
         fleeting = spots[:, 5] <= FOUND_AGAIN * (self.state.frames - spots[:, 6])
-        separation = np.linalg.norm(places[:, None] - spots[:, :3], axis=-1)
-        beside = (separation > BESIDE_M[0]) & (separation < BESIDE_M[1])
-        beside &= spots[:, 3] < STANDS_OUT * snr[:, None]
+        beside = self._beside(places) & (spots[:, 3] < STANDS_OUT * snr[:, None])
         like = beside & (STANDS_OUT * spots[:, 3] > snr[:, None])
 
         def is_surface(some: np.ndarray) -> np.ndarray:

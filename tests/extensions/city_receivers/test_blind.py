@@ -221,7 +221,7 @@ def terminal(amplitude, groups=None, antennas=ANTENNAS):
     receivers = Receivers(link_acquisition="blind", symbol_decision="beams")
     free = antennas.gain * W.wavelength / (4 * np.pi * 25)
     sent = amplitude / free
-    blind = OutOfSequence(PassiveReceiver.of(antennas, receivers, ORDER, groups), W)
+    blind = OutOfSequence(PassiveReceiver.of(antennas, receivers, ORDER, groups), W, None)
     settings = W, antennas, receivers, Tracking(), ORDER, sent, groups
     return PassiveTerminal(*settings, Equipment(other_paths=blind))
 
