@@ -703,8 +703,8 @@ OF_TESTS = (
         "test_ghosts::test_what_others_report_is_a_target",
         Bug(
             "extensions/city_receivers/ghosts.py",
-            "self.fits_best(told) == of.row[:, None]",
-            "np.ones((of.row.size, len(told)), bool)",
+            "self.whose == of.row[:, None]",
+            "np.ones((of.row.size, len(self.told)), bool)",
         ),
     ),
     (

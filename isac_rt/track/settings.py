@@ -30,7 +30,7 @@ class Tracking(Node):
     thousand."""
     confirm_hits: Annotated[int, Field(ge=1)] = 3
     """Detections within `confirm_window` frames that confirm a track. Three of five, the default,
-    let hardly any false alarm become a track. With `initiation: unexplained` two do, and odds."""
+    let hardly any false alarm become a track; `initiation: unexplained` asks odds after two."""
     confirm_window: Annotated[int, Field(ge=1)] = 5
     """Frames within which `confirm_hits` detections must fall to confirm a track; more of them
     confirm weak targets too, and more false ones. The default is the usual three of five."""

@@ -69,9 +69,9 @@ def test_an_artefact_says_by_the_odds_against_it_what_it_may():
 
 
 def test_a_track_is_reported_while_it_is_a_target_more_probably_than_not():
-    """Two detections confirm a track; a miss makes it an artefact more
-    probably, the next detection a target again. Without a city only confirmation counts. Planted
-    bugs: confirmation alone is reported; odds that do not fall; a record with the frame itself."""
+    """Two detections confirm a track; a miss makes it an artefact more probably, the next detection
+    a target again. Without a city only confirmation counts. Planted bugs: confirmation alone is
+    reported; odds that do not fall; a record with the frame itself."""
     for settings, reported in (
         (Tracking(initiation="unexplained"), [False, True, False, True, True]),
         (Tracking(confirm_hits=2), [False, True, True, True, True]),

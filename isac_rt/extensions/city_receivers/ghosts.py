@@ -213,20 +213,20 @@ def suspicion(
         np.full(count, -1, np.int32),
         np.full(count, np.inf),
     )
-    held = _Held(tracks, own, walls, leeway)
+    told = tracks.select(np.zeros(count, bool)) if reported is None else reported
+    held = _Held(tracks, own, walls, leeway, told)
     ends = [own.position + to for to in ([0.0] if held.sender is None else [0.0, held.sender[:3]])]
     for k in np.flatnonzero(~tracks.is_reference if asked is None else asked):
         place, P = own.position + tracks.mean[k, :3], tracks.covariance[k, :3, :3]
         out.behind[k] = occluded_by(place, P, ends, walls, leeway.resolution[0])
     sources = [(tracks, int(s)) for s in np.flatnonzero(tracks.confirmed & (out.behind < 0))]
-    if reported is not None:
-        sources += [(reported, int(s)) for s in np.flatnonzero(held.useful(reported))]
+    sources += [(told, int(s)) for s in np.flatnonzero(held.useful)]
     found = [of for known, s in sources if (of := held.explained(known, s, single)).row.size]
     is_target = tracks.confirmed & ~tracks.is_reference & (out.behind < 0)
     for of in found:
         is_target[of.row] = False
     for of in found:
-        ratio = held.density(of, is_target, reported) / (SHOWN * of.likelihood)
+        ratio = held.density(of, is_target) / (SHOWN * of.likelihood)
         for i, k in enumerate(of.row):
             if ratio[i] < out.ratio[k]:
                 out.mirrored[k], out.order[k] = of.faces[i], of.orders[i]
@@ -266,12 +266,13 @@ class _Explained(NamedTuple):
 
 @dataclass(frozen=True)
 class _Held:
-    """Tracks that are held against a mesh."""
+    """Tracks that are held against a mesh, and the UAVs that others report (S,)."""
 
     tracks: TrackSet
     own: Pose
     walls: Walls
     leeway: Leeway
+    told: TrackSet
 
     @cached_property
     def sender(self) -> np.ndarray | None:
@@ -279,7 +280,7 @@ class _Held:
         is_reference = self.tracks.is_reference
         return self.tracks.mean[is_reference][0] if is_reference.any() else None
 
-    def density(self, of: _Explained, is_target: np.ndarray, told: TrackSet | None) -> np.ndarray:
+    def density(self, of: _Explained, is_target: np.ndarray) -> np.ndarray:
         """Return how many targets (n,) there are by unit of range [m], rate [m/s] and direction
         cosines where tracks are measured as in `of`: about those that are targets (K,), one
         anywhere, and one where others report one that the track fits best."""
@@ -295,27 +296,26 @@ class _Held:
             return np.asarray(peak * np.exp(-(off**2).sum(axis=2) / 2))
 
         out += near(self.tracks.measured[is_target], APART).sum(axis=1)
-        if told is not None:
-            counts = self.fits_best(told) == of.row[:, None]
-            counts &= np.arange(len(told)) != of.report
-            out += (near(told.measured, told.std) * counts).sum(axis=1)
-        return out
+        counts = (self.whose == of.row[:, None]) & (np.arange(len(self.told)) != of.report)
+        return out + (near(self.told.measured, self.told.std) * counts).sum(axis=1)
 
-    def fits_best(self, told: TrackSet) -> np.ndarray:
-        """Return which track (S,) fits each UAV best that others report; -1: the reference."""
-        off = self.leeway.off(told.measured[:, None] - self.tracks.measured)
-        std = np.hypot(told.std[:, None], self.tracks.std)
+    @cached_property
+    def whose(self) -> np.ndarray:
+        """(S,) track that each fits best that others report; -1: it is the reference."""
+        off = self.leeway.off(self.told.measured[:, None] - self.tracks.measured)
+        std = np.hypot(self.told.std[:, None], self.tracks.std)
         cost = ((off / std) ** 2 + 2 * np.log(std)).sum(axis=2)
         cost[:, self.tracks.is_reference] = np.inf
-        return np.where(told.is_reference, -1, cost.argmin(axis=1))
+        return np.where(self.told.is_reference, -1, cost.argmin(axis=1))
 
-    def useful(self, told: TrackSet) -> np.ndarray:
-        """Return which UAVs that others report (S,) may explain tracks."""
-        sure = (told.std < self.leeway.resolution).all(axis=1) & ~told.is_reference
+    @property
+    def useful(self) -> np.ndarray:
+        """(S,) which UAVs that others report may explain tracks."""
+        sure = (self.told.std < self.leeway.resolution).all(axis=1) & ~self.told.is_reference
         if self.sender is None:  # an own track tells how strong echoes may be; nothing masks it
             seen = self.tracks.select(self.tracks.confirmed)
-            off = self.leeway.off(told.measured[:, None] - seen.measured)
-            std = np.hypot(told.std[:, None], seen.std)
+            off = self.leeway.off(self.told.measured[:, None] - seen.measured)
+            std = np.hypot(self.told.std[:, None], seen.std)
             sure &= ~self.leeway.explained(off, std, self.leeway.pull()).any(axis=1)
         return np.asarray(sure)
 
@@ -432,9 +432,9 @@ def reflections(
         return Paths(last[1:], np.ones(last.size - 1, int), seen[1:, :, 0], seen[1:, :, 1:])
     start = sender + here
     first, images, turned = _images(state + here, start, walls, reach)
-    far, near = (measure(images, own, end) for end in (start, None))
+    way = measure(images, own, start) - measure(images, own)
     slopes = -transmitter_jacobian(images, start) @ turned
-    sent = np.concatenate([(far - near)[..., None], slopes], axis=2)
+    sent = np.concatenate([way[..., None], slopes], axis=2)
     faces = np.where(first >= 0, first, last[:, None]).T
     orders = (first >= 0)[:, None].astype(int) + (last >= 0)
     out = (sent[:, None] + seen)[orders > 0]

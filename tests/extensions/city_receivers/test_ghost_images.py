@@ -182,7 +182,6 @@ def test_what_walls_show_is_as_uncertain_as_its_source(sender):
     for axis, step in enumerate(1e-3 * np.eye(6)):
         slope = (shown(BODY - HERE + step).measured - shown(BODY - HERE - step).measured) / 2e-3
         np.testing.assert_allclose(found.slopes[..., axis], slope, rtol=0, atol=1e-6)
-        np.testing.assert_allclose(found.slopes[..., axis], slope, rtol=0, atol=1e-6)
     way = 1e-3 * np.array([0.3, -0.8, 0.5, 0.9, 0.2, -0.6])  # errors that are one: correlated
     off = (shown(BODY - HERE + way).measured - shown(BODY - HERE - way).measured) / 2
     np.testing.assert_allclose(found.std(np.outer(way, way)), np.abs(off), rtol=0, atol=1e-8)

@@ -7,11 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isac_rt.extensions.city_receivers.images import (
-    Images,
-    Ways,
-    _images,
-)
+from isac_rt.extensions.city_receivers.images import Images, Ways, _images
 from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
