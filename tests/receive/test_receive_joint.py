@@ -442,6 +442,22 @@ def test_deviations_grow_with_what_is_not_explained(snr_db: float, widened: bool
     assert ratio == pytest.approx(np.sqrt(by_hand) if widened else 1.0, rel=0.1)
 
 
+def test_a_direction_that_a_row_does_not_tell_stays_where_it_was():
+    """Receivers in a row along X: elevation is as given, with an infinite deviation, and all else
+    within five deviations of the truth. Planted bug: elevation among the parameters, whose Gram
+    matrix has no inverse."""
+    w, schedule, payload = frame(waveform=SHORT)
+    row, truth = replace(ANTENNAS, rx_x=5, rx_z=1), np.array(LOS)
+    cube = noisy(w, schedule, samples(w, schedule, payload, row, truth, 1), 100.0, 3)
+    start = truth[:4] + np.array([*(0.1 * in_cells(w, 1)[:2]), 0.02, 0.0])
+    path = JointPath(start[0] / C, start[1] / C, start[2:], np.ones(1), np.zeros(4))
+    found = fit(Moments(cube.samples, known(w, schedule, payload, row, 1)), [path]).paths[0]
+    assert found.direction[1] == truth[3] and np.isinf(found.std[3])
+    off = [found.delay * C - truth[0], found.delay_rate * C - truth[1]]
+    off = np.abs([*off, found.direction[0] - truth[2]])
+    assert (off < 5 * found.std[:3] * [C, C, 1]).all() and found.std[2] < 0.02
+
+
 def test_two_echoes_in_one_cell_at_the_active_terminal():
     w, schedule, payload = frame(waveform=LONGER)
     cell, bin_ = w.range_cell(2), w.velocity_cell(2)

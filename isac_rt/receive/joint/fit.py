@@ -55,11 +55,6 @@ MAX_DRIFT = 0.05
 """Of its deviations a settled path may be moved by what other paths' later steps leave."""
 
 
-def amplitude_index(known: Known) -> np.ndarray:
-    """(M, P) which of a path's amplitudes each chirp has."""
-    return known.schedule if known.passes == 1 else np.zeros_like(known.schedule)
-
-
 class Fit(NamedTuple):
     """Paths of a fit, in the order of its start, and the energy of the samples that they leave."""
 
@@ -80,7 +75,8 @@ def match_chirps(moments: Moments, path: JointPath) -> np.ndarray:
     phase."""
     known = moments.known
     sums = moments.of(Tones.of(known, [path])[0], Weights.by_chirp(known))[0, 0, 0].sum(axis=-1)
-    return sums.reshape(known.schedule.shape) * path.amplitude[amplitude_index(known)].conj()
+    sums = sums.reshape(known.schedule.shape)
+    return sums * path.amplitude[known.schedule if known.passes == 1 else 0].conj()
 
 
 def fit(
@@ -141,6 +137,8 @@ class _Descent:
         self.power = (np.abs(sums) ** 2 / self.samples).sum(axis=1)
         self.coupled = self._coupled(moments.noise)
         self.size = PARAMETERS + 2 * self.count
+        self.told = np.full(self.size, True)  # not the axes along which the array has one place
+        self.told[PARAMETERS - 2 : PARAMETERS] = known.antennas.observes(known.passes)
         self.explained = np.zeros(self.free)
         self.deviation = np.full((self.free, self.size), np.inf)
         self.stirred, self.stale = np.zeros(self.free), np.zeros(self.free, bool)
@@ -196,11 +194,12 @@ class _Descent:
         self.coupled = self._coupled(max(noise, self.moments.noise))
         for g in np.unique(self.group[active]):
             mine = np.flatnonzero(self.group == g)
-            cells = (mine[:, None] * self.size + np.arange(self.size)).ravel()
-            covariance = np.linalg.inv(gram[np.ix_(cells, cells)])
-            steps = (covariance @ gradient[cells]).reshape(mine.size, -1)
-            variance = np.maximum(np.diag(covariance), 0).reshape(steps.shape) * noise / 2
-            self.deviation[mine] = np.sqrt(variance)
+            told = (mine[:, None] * self.size + np.flatnonzero(self.told)).ravel()
+            covariance = np.linalg.inv(gram[np.ix_(told, told)])
+            steps = np.zeros((self.free, self.size))
+            steps.flat[told] = covariance @ gradient[told]
+            steps = steps[mine]
+            self.deviation.flat[told] = np.sqrt(np.maximum(np.diag(covariance), 0) * noise / 2)
             moved[mine] = (np.abs(steps) / np.maximum(self.deviation[mine], 1e-300)).max(axis=1)
             share = self._within_reach(mine, steps[:, :PARAMETERS] / LARGEST_STEP)
             self._move(mine, share * steps)
