@@ -24,9 +24,9 @@ from __future__ import annotations
 
 from math import log
 
-BIRTH = {1: log(1 / 12), 2: log(1 / 6)}
-"""Log-odds of a first detection by the passes of the range: of those that no rule refuses one of
-thirteen is of a new target at a passive terminal, one of seven at an active one."""
+BIRTH = log(1 / 6)
+"""Log-odds of a first detection: of those that no rule refuses at an active terminal one of seven
+is of a new target. At a passive one fewer are, but waiting loses more targets than it saves."""
 RECURS = 0.1
 """p_A: share of the frames in which an artefact is found where its track expects it."""
 SURE = log(200)

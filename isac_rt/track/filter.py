@@ -19,8 +19,9 @@ STD_FLOOR = np.array([1e-3, 1e-2, 2e-4, 2e-4])
 """Smallest measurement standard deviations [m, m/s, 1, 1]. At high SNR interpolation between cells
 dominates and is alike in successive frames: about 0.002 cell in range, 0.02 in velocity, 0.002 in
 angle."""
-INITIAL_SPEED_STD = 10.0
-"""Standard deviation of a UAV's velocity per axis before its first detection, about zero [m/s]."""
+INITIAL_SPEED_STD = np.array([10.0, 10.0, 3.0])
+"""Standard deviations of a UAV's velocity before its first detection, about zero, the last one
+upwards [m/s]: PX4's default limits are 12 m/s along, 3 m/s up and 1.5 m/s down."""
 INITIAL_SPEED_DEVIATIONS = 3.0
 """Largest speed of the second reading of an ambiguous velocity [`INITIAL_SPEED_STD`]."""
 INITIAL_POSITION_STD_LIMIT = 100.0
@@ -364,11 +365,11 @@ def initiate_all(
     and the states (K, 9) after each.
 
     The position follows from range and direction (front half-space), its covariance from the
-    inverse Jacobian. The velocity is zero in the world with `INITIAL_SPEED_STD` per axis,
-    conditioned on the measured rate, which fixes the component along the line of sight or the
-    bisector. The acceleration is zero with `acceleration_std` [m/s^2] per axis. An ambiguous
-    velocity gives two states, of the two readings nearest to rest; the second ones follow all first
-    ones and are left out above `INITIAL_SPEED_DEVIATIONS`.
+    inverse Jacobian. The velocity is zero in the world with `INITIAL_SPEED_STD`, conditioned on the
+    measured rate, which fixes the component along the line of sight or the bisector. The
+    acceleration is zero with `acceleration_std` [m/s^2] per axis. An ambiguous velocity gives two
+    states, of the two readings nearest to rest; the second ones come last and are left out above
+    `INITIAL_SPEED_DEVIATIONS`.
     """
     there = None if transmitter is None else transmitter.mean
     # first reading: nearest to rest; second: one period farther, on the other side of rest
@@ -385,7 +386,7 @@ def initiate_all(
     mean = resting(read, own, there)
     H = jacobian(mean, own, there)
     speed = np.abs((read - measure(mean, own, there))[:, 1])
-    limit = INITIAL_SPEED_DEVIATIONS * INITIAL_SPEED_STD * np.linalg.norm(H[:, 1, 3:6], axis=1)
+    limit = INITIAL_SPEED_DEVIATIONS * np.linalg.norm(H[:, 1, 3:6] * INITIAL_SPEED_STD, axis=1)
     fits = (np.arange(len(read)) < len(measurement)) | (speed <= limit)
     J = H[:, POSITION, :3]
     rho = np.linalg.norm(mean[:, :3] - own.position, axis=1)
@@ -398,7 +399,7 @@ def initiate_all(
     back = np.linalg.inv(J[some])
     position = back @ R[:, POSITION[:, None], POSITION] @ np.swapaxes(back, 1, 2)
     P = np.zeros((len(which), 9, 9))
-    P[:] = np.diag([0.0] * 3 + [INITIAL_SPEED_STD**2] * 3 + [acceleration_std**2] * 3)
+    P[:] = np.diag([0.0] * 3 + [*INITIAL_SPEED_STD] + [acceleration_std] * 3) ** 2
     P[:, :3, :3] = (position + np.swapaxes(position, 1, 2)) / 2
     along, bent = back[:, :, :1], curvature(Gaussian(mean, P), own, there)[:, :1, :1]
     P[:, :3, :3] += bent * along * np.swapaxes(along, 1, 2)

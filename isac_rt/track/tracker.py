@@ -324,8 +324,7 @@ class Tracker(Stateful):
             track.first_id = first.setdefault(q, track.id)
             track.last = self.state.time
             track.confirmed = s.confirm_hits == 1
-            if self.by_odds:
-                track.odds = existence.BIRTH[2 if transmitter is None else 1]
+            track.odds = existence.BIRTH if self.by_odds else np.inf
             self.tracks.append(track)
 
     def _condition(

@@ -42,10 +42,10 @@ def test_odds_are_those_of_a_probability_of_which_nothing_is_known(misses):
     p^4 (1-p)^m over that of p, over the same of artefacts that recur with p_A. Planted bugs: n + 2
     in place of n + 1; the frame itself counted before it is judged."""
     p_A, n = existence.RECURS, 4
-    exact = existence.BIRTH[2] + betaln(n + 1, misses + 1) - betaln(2, 1)
+    exact = existence.BIRTH + betaln(n + 1, misses + 1) - betaln(2, 1)
     exact -= (n - 1) * np.log(p_A) + misses * np.log(1 - p_A)
     for order in set(permutations([True] * (n - 1) + [False] * misses)):
-        odds, hits, frames = existence.BIRTH[2], 1, 1
+        odds, hits, frames = existence.BIRTH, 1, 1
         for hit in order:
             odds = existence.updated(odds, hit, hits, frames)
             hits, frames = hits + hit, frames + 1
@@ -61,7 +61,7 @@ def test_an_artefact_says_by_the_odds_against_it_what_it_may():
         tracker.update(seen(0.0), OWN)
         (track,) = tracker.tracks
         tracker.doubt({track.id: ratio})
-        assert track.odds - existence.BIRTH[2] == pytest.approx(said)
+        assert track.odds - existence.BIRTH == pytest.approx(said)
         track.detection = -1
         before = track.odds
         tracker.doubt({track.id: ratio})
@@ -82,7 +82,7 @@ def test_a_track_is_reported_while_it_is_a_target_more_probably_than_not():
             tracker.update(d, OWN)
             said.append(bool(tracker.snapshot(OWN).confirmed[0]))
         assert said == reported
-        odds = existence.BIRTH[2] + betaln(5, 2) - betaln(2, 1)
+        odds = existence.BIRTH + betaln(5, 2) - betaln(2, 1)
         odds -= 3 * np.log(existence.RECURS) + np.log(1 - existence.RECURS)
         alone = tracker.tracks[0].odds
         assert alone == pytest.approx(odds) if tracker.by_odds else alone == np.inf

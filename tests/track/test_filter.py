@@ -14,6 +14,7 @@ from isac_rt.track.filter import (
     Ambiguity,
     Gaussian,
     expected,
+    initiate_all,
     measure,
     measurement_covariance,
     predict,
@@ -184,10 +185,10 @@ def test_initiation_is_refused_where_its_place_is_too_unsure(distance, there):
 
 
 def test_the_velocity_of_a_new_track_is_what_its_rate_says():
-    """At rest but for what is measured: 10 m/s per axis a priori make the velocity along the line
-    of sight (a reflector's: along the bisector, twice the half angle's cosine) known to its rate's
-    deviation and leave the others; the acceleration is open. Planted bugs: deviations for
-    variances; the rate of a moving terminal taken for the body's."""
+    """At rest but for what is measured: of 10 m/s a priori per horizontal axis and 3 m/s upwards
+    the rate, along the line of sight (a reflector's: along both ways' sum), takes its part by
+    Bayes, and leaves what lies across; the acceleration is open. Planted bugs: deviations for
+    variances; the rate of a moving terminal taken for the body's; upwards as along."""
     z = np.array([41.3, -6.1, 0.21, -0.13])
     e = STILL.rotation @ [0.21, np.sqrt(1 - 0.21**2 - 0.13**2), -0.13]
     for sender in (None, Gaussian(SENDER * ([1] * 3 + [0] * 6), np.zeros((9, 9)))):
@@ -197,15 +198,13 @@ def test_the_velocity_of_a_new_track_is_what_its_rate_says():
         if sender is not None:
             back = g.mean[:3] - sender.mean[:3]
             towards = e + back / np.linalg.norm(back)
-        slope = np.linalg.norm(towards)
-        share = 100 * slope**2 / (100 * slope**2 + STD[1] ** 2)
-        assert g.mean[3:6] == pytest.approx(share * -6.1 * towards / slope**2, abs=1e-3)
-        along, aside = towards / slope, np.cross(towards, [0.3, 0.4, 0.9])
-        aside /= np.linalg.norm(aside)
-        velocity = g.covariance[3:6, 3:6]
+        before = np.diag([100.0, 100.0, 9.0])
+        gain = before @ towards / (towards @ before @ towards + STD[1] ** 2)
+        assert g.mean[3:6] == pytest.approx(-6.1 * gain, abs=2e-3)
+        velocity, after = g.covariance[3:6, 3:6], before - np.outer(gain, towards @ before)
         # what the place's doubt adds: 10 m/s times 0.006 rad under the mean, of second order
-        assert along @ velocity @ along == pytest.approx((STD[1] / slope) ** 2 * share, rel=0.01)
-        assert aside @ velocity @ aside == pytest.approx(100, rel=0.01)
+        for way in (towards, np.cross(towards, [0.3, 0.4, 0.9]), np.array([0.1, 0.3, 2.0])):
+            assert way @ velocity @ way == pytest.approx(way @ after @ way, rel=0.03)
         assert not g.mean[6:].any()
         assert g.covariance[6:, 6:] == pytest.approx(1.7**2 * np.eye(3))
     moving = initiate(z, STD, OWN, acceleration_std=1.7)
@@ -238,7 +237,7 @@ def test_a_new_track_is_the_posterior_of_what_was_measured(bistatic):
     G = np.stack([place(read + d, nowhere) - place(read - d, nowhere) for d in step * np.eye(3)]).T
     P = np.zeros((9, 9))
     P[:3, :3] = (G / (2 * step)) @ np.diag(STD[[0, 2, 3]] ** 2) @ (G / (2 * step)).T
-    P[3:6, 3:6], P[6:, 6:] = 100 * np.eye(3), 1.7**2 * np.eye(3)
+    P[3:6, 3:6], P[6:, 6:] = np.diag([100, 100, 9]), 1.7**2 * np.eye(3)
     mean, variance = np.concatenate([place(read, nowhere), np.zeros(6)]), STD[1] ** 2
     if bistatic:
         doubt = sender.covariance[:6, :6]
@@ -284,6 +283,15 @@ def test_a_folded_velocity_shifts_the_range(passes, periods):
     assert cells * w.range_cell(1) == pytest.approx(0.0, abs=1e-4)
     off = wrapped((other - [tau, rate]) * metres, given)
     assert off == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+@pytest.mark.parametrize(("boresight", "readings"), [((0.0, 1.0, 0.0), 2), ((0.0, 0.0, 1.0), 1)])
+def test_a_second_reading_is_as_fast_as_uavs_fly_there(boresight, readings):
+    """2 m/s, or 26 m/s the other way, which is a UAV's speed along and not upwards. Planted bug: as
+    fast upwards as along."""
+    own, z = Pose.at_rest((0.0, 0.0, 0.0), boresight), np.array([[30.0, 2.0, 0.0, 0.0]])
+    about = {"acceleration_std": 1.7, "ambiguity": Ambiguity(28.0)}
+    assert len(initiate_all(z, STD[None], own, **about)[0]) == readings
 
 
 def test_initiation_reads_a_velocity_nearest_to_standing_still():

@@ -127,7 +127,7 @@ class StaticClutter(TrackRule):
         across = speed * np.linalg.norm(d.std[:, 2:], axis=1)
         allowed = STILL_MPS + 3 * np.hypot(d.std[:, 1], across)
         # between both ends of a passive link a UAV that flies along it has the rate of a still one
-        tells = INITIAL_SPEED_STD * seen[each, best] > 3 * allowed
+        tells = INITIAL_SPEED_STD.max() * seen[each, best] > 3 * allowed
         still = tells & (off[each, best] < allowed)
         place = place[each, best]
         some = still & d.starts & ~d.is_reference
@@ -191,7 +191,7 @@ def rests(track: Track) -> bool:
     velocity, P = track.state.mean[3:6], track.state.covariance[3:6, 3:6]
     d2, log_det = mahalanobis(
         np.tile(velocity, (2, 1)),
-        P + np.square([STILL_MPS, INITIAL_SPEED_STD])[:, None, None] * np.eye(3),
+        P + np.square([np.full(3, STILL_MPS), INITIAL_SPEED_STD])[:, None] * np.eye(3),
     )
     still, flies = -(d2 + log_det) / 2
     return bool(still - flies > np.log(STANDS_ODDS))

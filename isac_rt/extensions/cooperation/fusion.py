@@ -88,11 +88,6 @@ class Detection(NamedTuple):
     std: np.ndarray
 
     @property
-    def own_name(self) -> Name:
-        """The name that the track alone would give."""
-        return Name(self.since, *self.key)
-
-    @property
     def order(self) -> tuple[float, Key]:
         """Place among all detections."""
         return self.time, self.key
@@ -194,9 +189,9 @@ class FusedTracks(Stateful):
         first = STATES + POSE_ERRORS * len(terminals)
         self._pose = {name: STATES + POSE_ERRORS * k for k, name in enumerate(terminals)}
         self._bias = {link: first + k for k, link in enumerate(links)}
-        of_uav = [INITIAL_POSITION_STD_LIMIT, INITIAL_SPEED_STD, acceleration_std]
+        of_uav = [*[INITIAL_POSITION_STD_LIMIT] * 3, *INITIAL_SPEED_STD, *[acceleration_std] * 3]
         of_pose = np.tile(np.repeat([*POSE_STD, ATTITUDE_STD], 3), len(terminals))
-        self._prior = np.diag(np.square([*np.repeat(of_uav, 3), *of_pose, *np.zeros(len(links))]))
+        self._prior = np.diag(np.square([*of_uav, *of_pose, *np.zeros(len(links))]))
 
     def update(
         self,
@@ -234,7 +229,7 @@ class FusedTracks(Stateful):
         known = {key for uav in self.state.uavs for key in uav.members}
         for key, found in by_key.items():
             if key in kept and key not in known:
-                uav = FusedUav(found[-1].name, {key: found[-1].own_name})
+                uav = FusedUav(found[-1].name, {key: Name(found[-1].since, *key)})
                 uav.change(found)
                 self.state.uavs.append(uav)
         self.state.uavs = [

@@ -181,7 +181,7 @@ def joined(fused, detections):
     first, *others = sorted(detections, key=lambda d: d.time)[:2]
     fuse(fused, first.time, [first])
     for d in others:
-        fused.state.uavs[0].members[d.key] = d.own_name
+        fused.state.uavs[0].members[d.key] = Name(d.since, *d.key)
     return fused
 
 
