@@ -80,7 +80,7 @@ class Images(TrackRule):
             beside &= (away < self._beam + ALIAS_DEVIATIONS * d.std[:, None, 2:]).all(axis=-1)
         gain = self._antennas.element_gain(here.to_body(_unit(known.images[:, :3] - here.position)))
         for k in np.flatnonzero(beside.any(axis=0)):
-            beside[:, k] &= gain[k] > 0 and not self._walls.block(known.points[k])
+            beside[:, k] &= gain[k] > 0 and not self._walls.block(known.points[k], EDGE)
         return np.asarray(beside.any(axis=1))
 
 
@@ -160,8 +160,9 @@ def _by_two(
     at = np.flatnonzero(~sends)
     sends[at] = True
     for k, place, ahead in ((i, A, m - along * n), (j, B, n - along * m)):
-        steps = np.multiply.outer(CORNER_STEPS_M, _unit(ahead[at]))
-        sends[at] &= np.any([walls.holds(k[at], place[at] + s, 0.0) for s in steps], axis=0)
+        ahead = _unit(ahead[at])
+        on = [walls.holds(k[at], place[at] + s * ahead, s / 2) for s in CORNER_STEPS_M]
+        sends[at] &= np.any(on, axis=0)
     turned = mirror_image(mirror_image(start[3:], n), m)
     return np.hstack([at_j, turned])[sends], np.stack([A, B], axis=1)[sends]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -38,18 +39,13 @@ class Walls:
         return faces, normals, self.city.plane_offsets[faces] + normals @ self.city.origin
 
     @cached_property
-    def planes(self) -> np.ndarray:
-        """(W,) numbers of the mirrors' planes in the mesh."""
-        return self.city.plane_of_face[self.mirrors[0]]
-
-    @cached_property
     def _faces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Faces of the mirrors one after the other, where each mirror's begin, and the lowest and
         highest corner of each (2, W, 3), world coordinates."""
         plane = self.city.plane_of_face
-        order = np.argsort(plane, kind="stable")
-        faces = order[np.isin(plane[order], self.planes)]
-        first = np.append(np.searchsorted(plane[faces], self.planes), faces.size)
+        order, planes = np.argsort(plane, kind="stable"), plane[self.mirrors[0]]
+        faces = order[np.isin(plane[order], planes)]
+        first = np.append(np.searchsorted(plane[faces], planes), faces.size)
         corners = self.city.corners[faces] + self.city.origin
         if not faces.size:
             return faces, first, np.zeros((2, 0, 3))
@@ -154,8 +150,26 @@ class Walls:
         faces, share = hits(self.city.corners[near], *ends)
         return near[faces[(share > 0) & (share < 1)]]
 
-    def block(self, polyline: np.ndarray) -> bool:
-        """Return whether a face crosses a segment of a polyline (P, 3), but for its ends."""
-        inset = AT_WALL * np.diff(polyline, axis=0)
-        legs = np.stack([polyline[:-1] + inset, polyline[1:] - inset], axis=1)
-        return any(self.blocking(*leg).size for leg in legs[inset.any(axis=1)])
+    def block(self, polyline: np.ndarray, edge: float = 0.0) -> bool:
+        """Return whether faces cross a segment of a polyline (P, 3), but for its ends, and no way
+        leads round them by `edge` [m]: waves bend round what shows a part of their Fresnel zone."""
+        lines = np.diff(polyline, axis=0)
+        some = lines.any(axis=1)
+        starts, lines = polyline[:-1][some], lines[some]
+        share = np.clip(edge / np.linalg.norm(lines, axis=1), AT_WALL, 0.5)[:, None]
+        legs = np.stack([starts + share * lines, starts + (1 - share) * lines], axis=1)
+        return any(self._blocks(leg, edge) for leg in legs)
+
+    def _blocks(self, leg: np.ndarray, edge: float) -> bool:
+        start, end = leg - self.city.origin
+        box = np.array([np.minimum(start, end) - edge, np.maximum(start, end) + edge])
+        corners = self.city.corners[beside(self.city, box, slice(None))]
+        faces, share = hits(corners, start, end)
+        if not faces.size or not edge:
+            return faces.size > 0
+        middle = start + share.mean() * (end - start)
+        across = np.linalg.svd((end - start)[None])[2][1:]
+        turns = 2 * np.pi * np.arange(8)[:, None] / 8  # edges have any slope
+        round_by = middle + edge * (np.cos(turns) * across[0] + np.sin(turns) * across[1])
+        ways = ([start, via, end] for via in round_by)
+        return all(any(hits(corners, *part)[0].size for part in pairwise(way)) for way in ways)

@@ -126,6 +126,35 @@ def test_the_corner_of_a_house_sends_nothing_back():
     np.testing.assert_allclose(terrace, expected, atol=1e-8)
 
 
+@pytest.mark.parametrize(("side", "corner"), [(0.2, True), (0.4, False)])
+def test_a_corner_that_ends_beside_sends_back(side, corner):
+    """Wall and ground whose edge ends a hand before the place that sends back: a part of the
+    Fresnel zone meets both. Planted bug: the planes without what they may end short."""
+    ends = [[x, max(y, -3.1 + side), z] for x, y, z in WALL]
+    found = unique(own_images(OWN, city(ends, GROUND), 100.0))[:, 0]
+    assert np.isclose(found, np.hypot(9.6, 10.2)).any() == corner
+
+
+@pytest.mark.parametrize(("top", "hidden"), [(4.4, False), (4.6, True)])
+@pytest.mark.parametrize("deep", [0.0, 0.3])
+def test_waves_bend_round_an_edge(top, deep, hidden):
+    """A screen, and a house, half way to the wall whose edge is 0.2 or 0.4 m over the way: round by
+    0.3 m leads past the one. Planted bugs: straight ways alone; another edge for each face."""
+    at = [[6.0 + d, y, z] for d in (0.0, deep) for y, z in ((-9, 0), (3, 0), (3, top), (-9, top))]
+    walls = city(WALL, at[:4], *([at[4:]] if deep else []))
+    line = np.array([[1.7, -3.1, 4.2], [11.3, -3.1, 4.2], [1.7, -3.1, 4.2]]) + ORIGIN
+    assert walls.block(line) and walls.block(line, 0.3) == hidden
+
+
+@pytest.mark.parametrize(("before", "hidden"), [(0.2, False), (0.4, True)])
+def test_what_touches_a_mirror_hides_nothing_of_it(before, hidden):
+    """A plate of 4 m before the place where the wave meets the wall. Planted bug: the way
+    is followed to its end."""
+    plate = [[11.3 - before, -3.1 + y, 4.2 + z] for y, z in ((-2, -2), (2, -2), (2, 2), (-2, 2))]
+    line = np.array([[1.7, -3.1, 4.2], [11.3, -3.1, 4.2], [1.7, -3.1, 4.2]]) + ORIGIN
+    assert city(WALL, plate).block(line, 0.3) == hidden
+
+
 @pytest.mark.parametrize(("width", "corner"), [(2.0, True), (0.9, False)])
 def test_a_car_and_the_ground_are_a_corner(width, corner):
     """A plate of 1.4 m^2 that stands on the ground sends back, one of 0.6 m^2 is no mirror. Planted
@@ -141,7 +170,7 @@ def within_a_face(walls: Walls, mirror: int, point: np.ndarray) -> bool:
     """Whether a place in a mirror's plane is off a face's sides by 0.3 m at most, by barycentric
     coordinates and the altitudes that they are shares of."""
     mesh = walls.city
-    for face in np.flatnonzero(mesh.plane_of_face == walls.planes[mirror]):
+    for face in np.flatnonzero(mesh.plane_of_face == mesh.plane_of_face[walls.mirrors[0][mirror]]):
         corners = mesh.corners[face] + ORIGIN
         shares = np.linalg.lstsq(np.vstack([corners.T, np.ones(3)]), np.append(point, 1.0))[0]
         sides = np.linalg.norm(np.roll(corners, 1, axis=0) - np.roll(corners, -1, axis=0), axis=1)
@@ -183,7 +212,7 @@ def test_all_ways_over_one_and_two_planes_are_found():
     walls = city(*np.array(quads).tolist())
     own = pose([3.7, -2.9, 4.2], [1.0, 0.3, 0.0])
     sender = np.append(ORIGIN + np.array([-7.1, 12.3, 8.4]), [4.3, -3.4, 2.2])
-    here, near = np.append(own.position, own.velocity), np.arange(len(walls.planes))
+    here, near = np.append(own.position, own.velocity), np.arange(len(walls.mirrors[0]))
     expected = []
     chains = [[i] for i in near] + [[i, j] for i in near for j in near if i != j]
     for chain in chains:
