@@ -150,7 +150,9 @@ def find_peaks(cube: IFCube, time: float, modulated: bool) -> Peaks:
     half_cells = np.empty(cells.shape, np.int64)
     values = np.empty((*cells.shape, num_rx), np.complex64)
     noise = np.empty(groups)
-    every = np.arange(chirps)
+    every, true = np.arange(chirps), np.linspace(-0.3, 0.3, 61)
+    # of a tone without a window at `true` cells from the middle one of three half cells
+    top = vertex(*(np.sinc(true - i / 2) ** 2 for i in (-1, 0, 1)))
     for m in range(groups):
         power = np.zeros((2, chirps, size), np.float32)
         for h in (0, 1):
@@ -163,7 +165,7 @@ def find_peaks(cube: IFCube, time: float, modulated: bool) -> Peaks:
             near = (at[:, None] + np.arange(-MIN_SPACING, MIN_SPACING + 1)) % (2 * size)
             left[every[:, None], near] = 0.0
             around = [dense[every, (at + i) % (2 * size)].astype(float) for i in (-1, 0, 1)]
-            cells[m, :, k] = at / 2 + _offset(*around)
+            cells[m, :, k] = at / 2 + np.interp(vertex(*around), top, true)
             half_cells[m, :, k] = at
             values[m, :, k] = spectra[at % 2, :, at // 2, every]
     phasor = np.exp(1j * np.pi * half_cells / 2 * ((size - 1) / size))
@@ -296,14 +298,6 @@ def _threshold(waveform: Waveform) -> float:
     """Power of a chirp's strongest cell in a beam that noise exceeds at `FALSE_RATE`, over that of
     a cell: half cells count as many as they are."""
     return float(np.log(2 * waveform.num_samples / FALSE_RATE))
-
-
-def _offset(before: np.ndarray, peak: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Where a tone lies between half cells, in cells from the middle one: the parabola's top, less
-    what it is off for a tone without a window."""
-    true = np.linspace(-0.3, 0.3, 61)
-    top = vertex(*(np.sinc(true - i / 2) ** 2 for i in (-1, 0, 1)))
-    return np.interp(vertex(before, peak, after), top, true)
 
 
 def _weights(direction: np.ndarray, antennas: Antennas, waveform: Waveform) -> np.ndarray:

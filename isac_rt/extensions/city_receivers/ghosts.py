@@ -6,9 +6,9 @@ enough to make it suspect:
 
 - Is it one of the echoes that a nearer UAV must have over walls? There (straight) and back (over
   a wall), the reverse, or over a wall on both ways: their ranges, rates and directions follow from
-  the source's state and the wall's plane. An echo over a wall is longer than the direct one, and
-  so weaker by a factor that the lengths bound. The source is another track, or a UAV that other
-  terminals report: one that the line of sight masks is received by its echoes over walls.
+  the source's state and the wall's plane, their power from lengths and from what the array makes of
+  two waves, but for the aspects. The source is another track, or a UAV that other terminals report:
+  one that the line of sight masks is received by its echoes over walls.
 - Does it lie behind a surface of the mesh? No UAV there could be seen straight.
 
 A passive terminal asks the same of its reflectors, whose echoes come from its reference, the active
@@ -17,17 +17,17 @@ terminal, as it tracks it; and whether one is that terminal itself over a wall.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import expit, ndtr
 
 from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas, folded, resolutions
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive.types import Detections
+from isac_rt.propagation.rcs import TR38901_STD_DB
 from isac_rt.track.filter import Ambiguity, jacobian, measure, transmitter_jacobian, wrapped
 from isac_rt.track.parts import Ownship, TrackRule
 from isac_rt.track.tracker import Track, Tracker, TrackSet, track_set
@@ -40,10 +40,6 @@ MEETING = 1e-9
 RESOLUTION_SHARE = 0.5
 """Share of the resolution that it may be off besides: echoes that share a cell pull each other's
 estimates."""
-ONE_WAY_SHARE = 2.0
-"""The same for the direction of an echo over a wall on one way at an active terminal: its transmit
-antennas see another direction than its receive antennas, so that the halves of the virtual array do
-not join, and the receive antennas' resolution is twice as wide."""
 AVERAGED = 9
 """Most frames over which a track averages the pull on its range and its rate."""
 SHOWN = 0.3
@@ -52,19 +48,14 @@ flights over six cities 0.02 to 0.38, and about 0.3 where there are many."""
 PULLED = 1.5
 """Factor by which what walls show of a UAV is farther off than the deviations of its state say: its
 echo over the ground pulls its height on boards, where it is off by 1.3 to 1.9 deviations (rms)."""
-STRADDLED, IN_PHASE = 2.0, 4.0
-"""Factors in power by which a path over walls may exceed what lengths allow: for cells that its
-source straddles, and at an active terminal for the two waves of an echo over a wall on one way, out
-over it and back, whose phases are the same."""
-ALIKE = 4.0
-"""Factor in power within which the waves of such an echo are found, and over the noise from which
-on both are."""
+ASPECT_STD_DB = np.sqrt(2) * TR38901_STD_DB["small"]
+"""Deviation of a UAV's cross-section over a wall from its direct one [dB]: it fluctuates by aspect,
+and walls show another one."""
 APART = np.array([3.0, 1.0, 0.1, 0.1])
 """Deviations of a target's range [m], rate [m/s] and direction cosines from another's, over one
 pass or two: swarms fly in formations."""
-CROSSING_M = 3.0
-"""Tracks that were reported before are held against the walls so near to them [m]: one that lay
-before all walls comes by here on its way behind one."""
+LEAST_SOURCE = 0.2
+"""A track that follows a target less probably than so, as from a first detection, explains none."""
 
 
 class Ghosts(TrackRule):
@@ -78,26 +69,18 @@ class Ghosts(TrackRule):
 
     def __init__(self, walls: Walls, leeway: Leeway) -> None:
         self._walls, self._leeway = walls, leeway
-        self._alone = np.zeros(1, bool)
-
-    def candidates(self, detections: Detections, own: Ownship) -> Detections:
-        self._alone = np.append(alone(detections, self._leeway), False)  # without a detection
-        return detections
 
     def prune(self, tracker: Tracker, own: Ownship) -> None:
         """Doubt the tracks that are a nearer target's echoes over a wall, of targets that others
-        report too, and those that lie behind one, which is asked where they are first to be
-        reported and where they pass one."""
-        credible = [t for t in tracker.tracks if t.credible]
-        if not credible:
+        report too, and those that lie behind one."""
+        if not any(one.credible for one in tracker.tracks):
             return
-        tracks, walls = tracker.snapshot(own.pose, own.reference), self._walls
-        new = {t.id for t in credible if t.id in own.tentative}
-        passing = {t.id for t in credible if walls.within(t.state.mean[:3], CROSSING_M)}
-        rows = np.isin(tracks.ids, [*new, *passing]) & ~tracks.is_reference
+        tracks = tracker.snapshot(own.pose, own.reference)
         others = track_set([Track.of_state(u.state) for u in own.reports], own.pose, own.reference)
-        single = self._alone[tracks.detection]
-        said = suspicion(tracks, own.pose, walls, self._leeway, others, rows, single)
+        exist = np.ones(len(tracks))
+        exist[~tracks.is_reference] = expit([one.odds for one in tracker.tracks])
+        rows = ~tracks.is_reference & (exist > LEAST_SOURCE)
+        said = suspicion(tracks, own.pose, self._walls, self._leeway, others, rows, exist)
         tracker.doubt(dict(zip(tracks.ids.tolist(), said.ratio.tolist(), strict=True)))
 
 
@@ -111,45 +94,54 @@ class Leeway:
         pass at a passive terminal
     ambiguity : of range and velocity
     cosine_period : of `Antennas`: an image may stand beyond the view
-    tells : (2,) bool, axes along which the array has three places or more: with two, two waves are
-        one from between them
+    tx, rx : (L, 2) places of transmit and receive elements [wavelengths], x and z
     """
 
     resolution: np.ndarray
     ambiguity: Ambiguity
     cosine_period: np.ndarray | float = np.inf
-    tells: tuple[bool, bool] = (True, True)
+    tx: np.ndarray = field(default_factory=lambda: np.zeros((1, 2)))
+    rx: np.ndarray = field(default_factory=lambda: np.zeros((1, 2)))
 
     @classmethod
     def of(cls, waveform: Waveform, antennas: Antennas, passes: int) -> Leeway:
         """At an active terminal (2 passes) or a passive one (1)."""
         cells = resolutions(waveform, antennas, passes)
         cosine_period = antennas.cosine_period(waveform.wavelength, passes)
-        across, up = antennas.places(passes)
-        return cls(cells, Ambiguity.of(waveform, passes), cosine_period, (across > 2, up > 2))
+        both = antennas.tx_positions, antennas.rx_positions
+        places = (of[:, [0, 2]] / waveform.wavelength for of in both)
+        return cls(cells, Ambiguity.of(waveform, passes), cosine_period, *places)
 
     def off(self, difference: np.ndarray) -> np.ndarray:
         """Return differences (..., 4) of paths' measures, the least that ambiguities leave."""
         off = wrapped(difference, self.ambiguity)
         return np.concatenate([off[..., :2], folded(off[..., 2:], self.cosine_period)], axis=-1)
 
-    def pull(self, one_way: bool | np.ndarray = False, age: int | np.ndarray = 0) -> np.ndarray:
+    def pull(self, age: int | np.ndarray = 0) -> np.ndarray:
         """Return by how much (..., 4) other echoes may change what a track of an `age` [frames]
-        measures, and whether of an active terminal's echo over a wall on `one_way`."""
-        share = np.where(np.asarray(one_way)[..., None], ONE_WAY_SHARE, RESOLUTION_SHARE)
-        share = np.where([False, False, True, True], share, RESOLUTION_SHARE)
+        measures."""
         looks = np.minimum(np.asarray(age)[..., None] + 1, AVERAGED)
-        share = share / np.where([True, True, False, False], np.sqrt(looks), 1.0)
-        return np.asarray(share * self.resolution)
+        averaged = np.where([True, True, False, False], np.sqrt(looks), 1.0)
+        return np.asarray(RESOLUTION_SHARE * self.resolution / averaged)
 
     def explained(self, off: np.ndarray, std: np.ndarray, pull: np.ndarray) -> np.ndarray:
         """Return whether differences `off` (..., 4) are insignificant, by deviations and pulls."""
         return np.asarray((np.abs(off) <= DEVIATIONS * std + pull).all(axis=-1))
 
-    def apart(self, paths: np.ndarray) -> np.ndarray:
-        """(P,) whether the array tells the two waves of `echoes` (P, 4) on one way apart."""
-        off = np.abs(self.off(paths[3::4] - paths[0::4]))[:, 2:] > self.resolution[2:]
-        return np.repeat((off & self.tells).any(axis=1), 4)
+    def waves(self, towards: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what all channels added up towards directions (..., 2) receive of two equal waves,
+        out from one of both `ends` (P, 2, 2) and in from the other: the power (..., P) over that of
+        one wave from there, 4 at most, and half the side of a square of direction cosines over
+        which detections are spread as they are there. Over all directions the power adds up to
+        the channels' mean power by their number (Parseval, if no two are at the same place)."""
+        off = 2 * np.pi * (ends - np.asarray(towards)[..., None, None, :])
+        sent, received = (np.exp(1j * off @ of.T).mean(axis=-1) for of in (self.tx, self.rx))
+        response = np.maximum(np.abs((sent * received[..., ::-1]).sum(axis=-1)) ** 2, 1e-9)
+        apart = 2 * np.pi * (ends[:, 0] - ends[:, 1])
+        one, other = (np.exp(1j * apart @ of.T).mean(axis=-1) for of in (self.tx, self.rx))
+        power = 2 + 2 * (one * other.conj()).real
+        field = power * np.prod(np.minimum(2.0, self.cosine_period) * np.ones(2))
+        return response, np.sqrt(field / (4 * len(self.tx) * len(self.rx) * response))
 
 
 @dataclass(frozen=True)
@@ -188,7 +180,7 @@ def suspicion(
     leeway: Leeway,
     reported: TrackSet | None = None,
     asked: np.ndarray | None = None,
-    single: np.ndarray | None = None,
+    exist: np.ndarray | None = None,
 ) -> Suspicion:
     """Hold the tracks of a terminal against the mesh.
 
@@ -203,7 +195,8 @@ def suspicion(
         known to a resolution would explain anything, and are left out, as are those that an
         active terminal tracks itself
     asked : (K,) bool, the tracks that may lie behind a wall; None: all but the reference
-    single : (K,) bool, those whose detection is `alone`; None: none
+    exist : (K,) probabilities that tracks follow a target, which may explain others; None: those of
+        the confirmed ones are 1, of the others 0
     """
     count = len(tracks)
     out = Suspicion(
@@ -219,14 +212,16 @@ def suspicion(
     for k in np.flatnonzero(~tracks.is_reference if asked is None else asked):
         place, P = own.position + tracks.mean[k, :3], tracks.covariance[k, :3, :3]
         out.behind[k] = occluded_by(place, P, ends, walls, leeway.resolution[0])
-    sources = [(tracks, int(s)) for s in np.flatnonzero(tracks.confirmed & (out.behind < 0))]
+    exist = tracks.confirmed.astype(float) if exist is None else exist
+    sources = [(tracks, int(s)) for s in np.flatnonzero((exist > LEAST_SOURCE) & (out.behind < 0))]
     sources += [(told, int(s)) for s in np.flatnonzero(held.useful)]
-    found = [of for known, s in sources if (of := held.explained(known, s, single)).row.size]
+    found = [of for known, s in sources if (of := held.explained(known, s)).row.size]
     is_target = tracks.confirmed & ~tracks.is_reference & (out.behind < 0)
     for of in found:
         is_target[of.row] = False
     for of in found:
-        ratio = held.density(of, is_target) / (SHOWN * of.likelihood)
+        exists = exist[tracks.ids == of.source][0] if of.report < 0 else 1.0
+        ratio = held.density(of, is_target) / (SHOWN * exists * of.likelihood)
         for i, k in enumerate(of.row):
             if ratio[i] < out.ratio[k]:
                 out.mirrored[k], out.order[k] = of.faces[i], of.orders[i]
@@ -245,6 +240,7 @@ class _Explained(NamedTuple):
     faces, orders : of the path
     off, std, pull : (n, 4) by how much the track is off, deviations, and the most that other echoes
         change
+    as_strong : (n,) probability that the path is as strong as the track
     """
 
     row: np.ndarray
@@ -255,13 +251,15 @@ class _Explained(NamedTuple):
     off: np.ndarray
     std: np.ndarray
     pull: np.ndarray
+    as_strong: np.ndarray
 
     @property
     def likelihood(self) -> np.ndarray:
-        """(n,) density of normal errors and pulls that are alike up to the most."""
+        """(n,) density of normal errors and pulls that are alike up to the most, for an echo as
+        strong."""
         off = np.abs(self.off)
         share = ndtr((self.pull - off) / self.std) - ndtr((-self.pull - off) / self.std)
-        return np.asarray((share / (2 * self.pull)).prod(axis=1))
+        return np.asarray((share / (2 * self.pull)).prod(axis=1) * self.as_strong)
 
 
 @dataclass(frozen=True)
@@ -285,12 +283,13 @@ class _Held:
         cosines where tracks are measured as in `of`: about those that are targets (K,), one
         anywhere, and one where others report one that the track fits best."""
         z, std, leeway = self.tracks.measured[of.row], self.tracks.std[of.row], self.leeway
+        pull = leeway.pull(self.tracks.age[of.row])
         span = np.array([self.tracks.range.max(), leeway.ambiguity.period, 2.0, 2.0])
         span[2:] = np.minimum(span[2:], leeway.cosine_period)
-        out = 1 / np.maximum(span, 2 * of.pull).prod(axis=1)
+        out = 1 / np.maximum(span, 2 * pull).prod(axis=1)
 
         def near(places: np.ndarray, apart: np.ndarray) -> np.ndarray:
-            blurred = np.sqrt(apart**2 + (std**2 + of.pull**2 / 3)[:, None])
+            blurred = np.sqrt(apart**2 + (std**2 + pull**2 / 3)[:, None])
             off = leeway.off(z[:, None] - places) / blurred
             peak = 1 / (np.sqrt(2 * np.pi) * blurred).prod(axis=2)
             return np.asarray(peak * np.exp(-(off**2).sum(axis=2) / 2))
@@ -327,43 +326,39 @@ class _Held:
         start = None if known.is_reference[s] else self.sender
         return reflections(known.mean[s], start, self.own, self.walls, reach)
 
-    def explained(self, known: TrackSet, s: int, single: np.ndarray | None) -> _Explained:
-        """Return which tracks are echoes of a source over walls by their measures."""
+    def explained(self, known: TrackSet, s: int) -> _Explained:
+        """Return which tracks are echoes of a source over walls by their measures. An active
+        terminal's over a wall on one way has no direction, for its channels receive two waves."""
         shown, tracks, leeway = self.shown(known, s), self.tracks, self.leeway
-        std = np.hypot(tracks.std, known.std[s])
-        one_way = (shown.orders == 1) & (self.sender is None)
         may_be = ~tracks.is_reference & (tracks.range > known.range[s])
-        most = known.snr[s] * _weaker(known, s, self.sender, tracks.range)
+        most = np.tile(_weaker(known, s, self.sender, tracks.range), (shown.orders.size, 1)).T
         if known is not tracks:  # a track of the UAV itself is no echo of it
             off = leeway.off(tracks.measured - known.measured[s])
+            std = np.hypot(tracks.std, known.std[s])
             may_be &= ~leeway.explained(off, std, leeway.pull())
         of_source = np.maximum(known.std[s], PULLED * shown.std(known.covariance[s]))
         off = leeway.off(tracks.measured[:, None] - shown.measured)
         std = np.hypot(tracks.std[:, None], of_source)
-        pull = leeway.pull(one_way, tracks.age[:, None])
-        hit = leeway.explained(off, std, pull) & may_be[:, None]
-        hit &= tracks.snr[:, None] <= np.where(one_way, IN_PHASE, STRADDLED) * most[:, None]
-        if single is not None and self.sender is None:
-            hit &= ~(single[:, None] & one_way & leeway.apart(shown.measured))
+        pull = np.broadcast_to(leeway.pull(tracks.age)[:, None], off.shape)
+        if shown.ends is not None:
+            one_way = shown.orders == 1
+            response, beam = leeway.waves(tracks.measured[:, 2:], shown.ends)
+            most = np.where(one_way, response, 1.0) * most
+            open_side = one_way[:, None] & np.array([False, False, True, True])
+            off = np.where(open_side, 0.0, off)
+            pull = np.where(open_side, beam[..., None], pull)
+        with np.errstate(divide="ignore", invalid="ignore"):  # no power is told of reports
+            excess = 10 * np.log10(tracks.snr[:, None] / (known.snr[s] * most)) / ASPECT_STD_DB
+        hit = leeway.explained(off, std, pull) & may_be[:, None] & (excess < DEVIATIONS)
         row, path = np.nonzero(hit)
-        of_pair = (a[row, path] for a in np.broadcast_arrays(off, std, pull))
+        of_pair = (of[row, path] for of in (off, std, pull, ndtr(-excess)))
         source, report = int(known.ids[s]), -1 if known is tracks else s
         return _Explained(row, source, report, shown.faces[path], shown.orders[path], *of_pair)
 
 
-def alone(d: Detections, leeway: Leeway) -> np.ndarray:
-    """Return which detections (Q,) are too strong for an echo over a wall on one way without its
-    other wave, which comes from elsewhere."""
-    off = np.abs(leeway.off(d.measured[:, None] - d.measured))
-    near, far = off < leeway.resolution, off >= leeway.resolution  # neither without a direction
-    other = near[..., :2].all(axis=2) & far[..., 2:].any(axis=2)
-    other &= ALIKE * d.snr > d.snr[:, None]
-    return np.asarray((d.snr > ALIKE) & ~other.any(axis=1))
-
-
 def _weaker(known: TrackSet, s: int, sender: np.ndarray | None, ranges: np.ndarray) -> np.ndarray:
-    """Return a bound on the power of echoes of track `s` over walls, of such ranges (K,), relative
-    to its direct one: no segment is shorter than the direct path's."""
+    """Return the power of echoes of track `s` over walls, of such ranges (K,), relative to its
+    direct one, at most: no segment is shorter than the direct path's."""
     back = float(np.linalg.norm(known.mean[s, :3]))
     if known.is_reference[s]:
         return (back / ranges) ** 2
@@ -382,12 +377,14 @@ class Paths(NamedTuple):
     orders : (P,) bounces
     measured : (P, 4) range, its rate, u_x, u_z
     slopes : (P, 4, 6) by the UAV's position and velocity
+    ends : (P, 2, 2) of an active terminal's, u_x, u_z out and in: walls on one way have both orders
     """
 
     faces: np.ndarray
     orders: np.ndarray
     measured: np.ndarray
     slopes: np.ndarray
+    ends: np.ndarray | None = None
 
     def std(self, covariance: np.ndarray) -> np.ndarray:
         """Return deviations (P, 4) for a UAV's covariance (6, 6): a height that its range and its
@@ -396,23 +393,22 @@ class Paths(NamedTuple):
 
 
 def echoes(state: np.ndarray, own: Pose, walls: Walls, reach: float = np.inf) -> Paths:
-    """Return a target's echoes over each single wall, four of each, images beyond `reach` [m] left
+    """Return a target's echoes over each single wall, two of each, images beyond `reach` [m] left
     out.
 
     `state` (6,) is position and velocity relative to the terminal, world axes. Over the wall on one
-    way two equal waves arrive, from the UAV and from the image, at the mean of the two ranges;
-    where the virtual array, which adds the phases of both ways, points then is left open: at the
-    UAV, at the image or midway. Over it on both ways the echo is the image's.
+    way two equal waves arrive, from the UAV and from the image, at the mean of all measures. Over
+    it on both ways the echo is the image's.
     """
     here = np.concatenate([own.position, own.velocity])
     faces, images, turned = _images(state + here, here, walls, reach)
     seen = np.concatenate([measure(images, own)[..., None], jacobian(images, own) @ turned], axis=2)
-    mirrored, middle = seen[1:], (seen[1:] + seen[0]) / 2
-    direct = np.broadcast_to(seen[0], mirrored.shape)
-    out = np.stack([direct, mirrored, middle, mirrored], axis=1)
-    out[:, :3, :2] = middle[:, None, :2]
-    out, orders = out.reshape(-1, 4, 7), np.tile([1, 1, 1, 2], len(mirrored))
-    return Paths(np.repeat(faces[1:], 4), orders, out[..., 0], out[..., 1:])
+    direct, mirrored = np.broadcast_to(seen[0], seen[1:].shape), seen[1:]
+    out = np.stack([(direct + mirrored) / 2, mirrored], axis=1).reshape(-1, 4, 7)
+    ends = np.stack([[direct, mirrored], [mirrored, mirrored]])[..., 2:, 0]  # way, end, wall, u
+    ends = ends.transpose(2, 0, 1, 3).reshape(-1, 2, 2)
+    orders = np.tile([1, 2], len(mirrored))
+    return Paths(np.repeat(faces[1:], 2), orders, out[..., 0], out[..., 1:], ends)
 
 
 def reflections(

@@ -101,7 +101,9 @@ class OutOfSequence(OtherPaths):
             return reception, False
         out = replace(out, detections=delayed(out.detections, own.clock, -1))
         strong = out.line_of_sight and reference.is_plausible(out, own.straight)
-        if strong and self._is_well_inside(out):
+        # near the edge of the view it may have come from the opposite one: a track would fly there
+        seen = np.abs(in_plane(out.detections).direction[out.detections.is_reference])
+        if strong and (seen < WELL_INSIDE * self._receiver.antennas.view_limit).all():
             self.forget()
             return out, True
         return out.without_sight(self._is_named(own)), False
@@ -118,13 +120,6 @@ class OutOfSequence(OtherPaths):
         over_walls = Ways.of_sender(there[:6], own.pose, self._walls, float(length[0]) + 1).seen
         difference = np.abs(np.concatenate([straight, over_walls[:, :2]]) - length)
         return bool((difference < NAMED_CELLS * self._cells).all(axis=1).any())
-
-    def _is_well_inside(self, reception: Reception) -> bool:
-        """Return whether the reference is not so near the edge of the view that it may have come
-        from the opposite one: a track of it would fly elsewhere."""
-        d = in_plane(reception.detections)
-        edge = WELL_INSIDE * self._receiver.antennas.view_limit
-        return bool((np.abs(d.direction[d.is_reference]) < edge).all())
 
     def read(self, cube: IFCube, time: float, hints: Hints, *, maps: bool) -> Reception | None:
         """A data frame that the line of sight does not read, over the path that is known or that it

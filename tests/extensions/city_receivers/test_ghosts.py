@@ -15,7 +15,6 @@ from scipy import special
 from isac_rt.extensions.city_receivers.ghosts import (
     Ghosts,
     Leeway,
-    alone,
     echoes,
     reflections,
     suspicion,
@@ -23,7 +22,6 @@ from isac_rt.extensions.city_receivers.ghosts import (
 from isac_rt.extensions.city_receivers.walls import Walls
 from isac_rt.frame.antennas import Antennas
 from isac_rt.frame.waveform import Waveform
-from isac_rt.receive.types import Detections
 from isac_rt.track import existence
 from isac_rt.track.filter import Ambiguity, Gaussian
 from isac_rt.track.parts import Ownship, ReportedUav
@@ -93,13 +91,22 @@ def length(start: np.ndarray, end: np.ndarray, over_wall: bool) -> float:
     )
 
 
+def square() -> Leeway:
+    """Of 16 receivers in four rows, and three transmitters that make eight of them."""
+    w = Waveform()
+    half = w.wavelength / 2
+    rx = [(x * half, z * half) for x in range(4) for z in range(4)]
+    board = Antennas.placed([(0, 0), (4 * half, 0), (0, 4 * half)], rx)
+    return replace(Leeway.of(w, board, 2), resolution=RESOLUTION, ambiguity=Ambiguity(PERIOD))
+
+
 def test_echoes_over_a_wall_are_the_shortest_ways_that_touch_it():
     """Range and rate of orders 1 and 2 against ways found by minimising their length (1e-8 m: the
     minimiser's), rates by differences over 1 ms (1e-3 m/s: curvature and minimiser over the step).
     Planted bugs: the image's velocity not mirrored; the origin left out of the plane."""
     state = BODY - np.concatenate([OWN.position - ORIGIN, OWN.velocity])
     found = echoes(state, OWN, Walls(wall()))
-    assert found.orders.tolist() == [1, 1, 1, 2]
+    assert found.orders.tolist() == [1, 2]
     h = 1e-3
 
     def ranges(t: float) -> dict[int, float]:
@@ -135,8 +142,9 @@ def test_blocked_segments_are_those_of_trimesh():
 
 def test_ghosts_are_suspected_and_bodies_are_not():
     """A body, its image behind the wall, an echo over one way seen in the body's own direction (so
-    before the wall), and another body of the same range and rate as that echo but elsewhere.
-    Planted bugs: directions not compared; only the image looked for."""
+    before the wall), and another body of the same range and rate as that echo but where the array
+    receives nothing of it.
+    Planted bugs: the response of the array left out; only the image looked for."""
     body, own = BODY[:3], OWN.position - ORIGIN
     image = image_of(body)
     image_velocity = BODY[3:] * TURNED
@@ -148,7 +156,10 @@ def test_ghosts_are_suspected_and_bodies_are_not():
         for p, v in ((body, BODY[3:]), (image, image_velocity))
     ]
     half_velocity = OWN.velocity + ahead * np.mean(rates)
-    aside = np.array([-0.6, 0.8, 0.0])
+    ends = np.array([[(p - own)[[0, 2]] / np.linalg.norm(p - own) for p in (body, image)]])
+    grid = np.stack([np.linspace(-0.7, -0.5, 99), np.zeros(99)], axis=1)
+    u = grid[square().waves(grid, ends)[0][:, 0].argmin(), 0]
+    aside = np.array([u, np.sqrt(1 - u**2), 0.0])
     beside, beside_velocity = own + mean * aside, OWN.velocity + aside * np.mean(rates)
     tracks = [
         track(3, body, BODY[3:]),
@@ -156,38 +167,39 @@ def test_ghosts_are_suspected_and_bodies_are_not():
         track(6, half, half_velocity),
         track(8, beside, beside_velocity),
     ]
-    found = suspicion(
-        track_set(tracks, OWN), OWN, Walls(wall()), Leeway(RESOLUTION, Ambiguity(PERIOD))
-    )
+    found = suspicion(track_set(tracks, OWN), OWN, Walls(wall()), square())
     assert found.suspect.tolist() == [False, True, True, False]
     assert found.order.tolist() == [0, 2, 1, 0] and found.source.tolist() == [-1, 3, 3, -1]
     assert (found.behind >= 0).tolist() == [False, True, False, False]
-    alone = suspicion(
-        track_set(tracks[2:], OWN), OWN, Walls(wall()), Leeway(RESOLUTION, Ambiguity(PERIOD))
-    )
-    assert not alone.suspect.any()
+    assert not suspicion(track_set(tracks[2:], OWN), OWN, Walls(wall()), square()).suspect.any()
 
 
-@pytest.mark.parametrize(("share", "mirrored"), [(0.95, True), (1.05, False)])
-def test_an_echo_over_a_wall_is_weaker_than_its_source(share, mirrored):
-    """The image of a UAV at 50 over the noise, as bright as twice a wave over one segment that is
-    longer by twice its range less the direct one: no more, though another terminal reports the UAV,
-    whose power it does not tell. Planted bugs: the power not asked; once a wave; the fourth power
-    of the direct segment; reports of UAVs that are tracked."""
+@pytest.mark.parametrize("share", [0.7, 3.0, 30.0, 50.0])
+def test_an_echo_over_a_wall_is_weaker_than_its_source(share):
+    """The image of a UAV at 50 over the noise is about as bright as a wave over one segment that is
+    longer by twice its range less the direct one, but for what both aspects return: two draws of
+    3.74 dB (TR 38.901). An image as bright or brighter is that echo by the tail of a normal, and
+    beyond three deviations it is not, though another terminal reports the UAV, whose power it does
+    not tell. Planted bugs: the power not asked; the fourth power of the direct segment; one draw;
+    reports of UAVs that are tracked."""
     body, own = BODY[:3], OWN.position - ORIGIN
     image = image_of(body)
     near, far = (float(np.linalg.norm(p - own)) for p in (body, image))
-    brightest = 2 * 50.0 * (near / (2 * far - near)) ** 2
     seen = track(5, image, BODY[3:] * TURNED)
-    seen.snr = share * brightest
-    tracks = track_set([track(3, body, BODY[3:]), seen], OWN)
-    asked = np.zeros(2, bool)  # only of the image
     at = Gaussian(np.concatenate([body + ORIGIN, BODY[3:]]), np.eye(6) * 1e-4)
     told = track_set([Track.of_state(at)], OWN)
+
+    def ratio(share: float, reported: TrackSet | None) -> float:
+        one = replace(seen, snr=share * 50.0 * (near / (2 * far - near)) ** 2)
+        tracks = track_set([track(3, body, BODY[3:]), one], OWN)
+        leeway, nobody = Leeway(RESOLUTION, Ambiguity(PERIOD)), np.zeros(2, bool)
+        return float(suspicion(tracks, OWN, Walls(wall()), leeway, reported, nobody).ratio[1])
+
+    tail = 1 - special.ndtr(10 * np.log10(share) / (np.sqrt(2) * 3.74))
+    weak = ratio(1e-3, None)
+    expected = weak / tail if share < 10 ** (3 * np.sqrt(2) * 0.374) else np.inf
     for reported in (None, told):
-        leeway = Leeway(RESOLUTION, Ambiguity(PERIOD))
-        found = suspicion(tracks, OWN, Walls(wall()), leeway, reported, asked)
-        assert (found.mirrored[1] >= 0) == mirrored
+        assert ratio(share, reported) == pytest.approx(expected, rel=1e-3)
 
 
 def test_bodies_that_others_know_of_explain_echoes():
@@ -275,31 +287,59 @@ def test_what_the_ground_shows_is_as_uncertain_as_the_climb(climb, std, expected
     assert found.order.tolist() == [0, expected]
 
 
-@pytest.mark.parametrize(
-    ("resolution", "tells", "expected"),
-    [(0.1, (True, True), 0), (0.1, (True, False), 1), (1.0, (True, True), 1)],
-)
-def test_one_wave_is_two_where_the_array_does_not_tell_them_apart(resolution, tells, expected):
-    """The body's echo over the ground as one detection in the cell, the directions of its two waves
-    0.3 apart in height. Planted bugs: one detection excuses any track; `tells` left out."""
-    tracks = track_set([track(3, LEVEL[:3], LEVEL[3:]), over_the_ground(0.0)], OWN)
-    cells = np.array([0.25, 0.249, resolution, resolution])
-    leeway = Leeway(cells, Ambiguity(PERIOD), tells=tells)
-    single, nobody = np.array([False, True]), np.zeros(2, bool)
-    found = suspicion(tracks, OWN, Walls(GROUND), leeway, None, nobody, single)
-    assert found.order.tolist() == [0, expected]
+def seen_at(u: np.ndarray) -> Track:
+    """Track of the level body's echo over the ground on one way as if it came from direction
+    cosines `u`."""
+    z = track_set([over_the_ground(0.0)], OWN)
+    e = np.array([u[0], np.sqrt(1 - u @ u), u[1]])
+    still = OWN.velocity + z.velocity * e
+    return track(6, OWN.position - ORIGIN + z.range * e, still)
 
 
-def test_boards_tell_waves_apart_where_they_have_three_places():
-    """A row of eight with one transmitter half a wavelength up: two places in height."""
+def test_what_a_board_makes_of_two_waves_is_their_echo():
+    """The body's echo over the ground, out from one of two directions and in from the other, as
+    sums over the channels one by one. Where those add up to a maximum it is explained, sidelobes of
+    a quarter too; where they cancel each other it is not. Planted bugs: both ways from one
+    direction; transmitters and receivers exchanged for one wave; amplitude for power."""
+    body, board = track(3, LEVEL[:3], LEVEL[3:]), square()
+    here, below = OWN.position - ORIGIN, np.array([1, 1, -1])
+    ends = [(p - here) / np.linalg.norm(p - here) for p in (LEVEL[:3], LEVEL[:3] * below)]
+    (out, back), wave = [e[[0, 2]] for e in ends], np.zeros((3, 16), complex)
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.7, 0.7, 41)] * 2), axis=-1).reshape(-1, 2)
+    received = np.zeros(len(grid), complex)
+    for t, tx in enumerate(board.tx):
+        for r, rx in enumerate(board.rx):
+            for first, last in ((out, back), (back, out)):
+                wave[t, r] += np.exp(2j * np.pi * (tx @ first + rx @ last))
+            received += wave[t, r] * np.exp(-2j * np.pi * grid @ (tx + rx)) / 48
+    power = np.abs(received) ** 2
+    found = board.waves(grid, np.array([[out, back]]))[0][:, 0]
+    assert found == pytest.approx(power, abs=1e-9)
+
+    def order(u: np.ndarray) -> int:
+        tracks = track_set([body, seen_at(u)], OWN)
+        return int(suspicion(tracks, OWN, Walls(GROUND), board, asked=np.zeros(2, bool)).order[1])
+
+    assert order(grid[power.argmax()]) == 1
+    assert order(grid[np.abs(power - power.max() / 4).argmin()]) == 1
+    assert order(grid[power.argmin()]) == 0
+
+
+@pytest.mark.parametrize("spacing", [0.5, 0.8])
+@pytest.mark.parametrize("end", [(0.52, 0.41), (0.14, -0.26)])
+def test_detections_are_somewhere(spacing, end):
+    """Squares of twice their side over a period of both cosines: the density of what two waves are
+    detected at adds up to 1, whether these come from far apart or nearly from one direction.
+    Numerically, as of a sum of harmonics. Planted bugs: a mean power of 2; a period of 2."""
     w = Waveform()
-    half = w.wavelength / 2
-    row = [(k * half, 0.0) for k in range(4)]
-    board = Antennas.placed([(0, 0), (4 * half, 0), (2 * half, half)], row)
-    assert Leeway.of(w, board, 2).tells == (True, False)
-    assert Leeway.of(w, board, 1).tells == (True, False)
-    square = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=half)
-    assert Leeway.of(w, square, 2).tells == (True, True)
+    rx = [
+        (x * spacing * w.wavelength, z * spacing * w.wavelength) for x in range(4) for z in (0, 1)
+    ]
+    board = Leeway.of(w, Antennas.placed([(0, 0), (4 * rx[2][0], 0)], rx), 2)
+    u = np.arange(64) / 64 / spacing
+    grid = np.stack(np.meshgrid(u, u), axis=-1).reshape(-1, 2)
+    side = 2 * board.waves(grid, np.array([[(0.13, -0.3), end]]))[1][:, 0]
+    assert (1 / side**2).mean() / spacing**2 == pytest.approx(1.0, rel=1e-6)
 
 
 @pytest.mark.parametrize(("age", "expected"), [(0, True), (8, False)])
@@ -316,6 +356,13 @@ def test_a_track_averages_what_pulls_it(age, expected):
     leeway = Leeway(RESOLUTION, Ambiguity(PERIOD))
     found = suspicion(tracks, OWN, Walls(wall()), leeway, asked=np.zeros(2, bool))
     assert (found.mirrored[1] >= 0) == expected
+
+
+def as_strong(tracks: TrackSet) -> float:
+    """Probability that the second track is an echo of the first by its power, by hand."""
+    near, far = tracks.range[:2]
+    brighter = tracks.snr[1] / tracks.snr[0] * ((2 * far - near) / near) ** 2
+    return float(special.ndtr(-10 * np.log10(brighter) / (np.sqrt(2) * 3.74)))
 
 
 def row_of_sixteen() -> Leeway:
@@ -353,7 +400,7 @@ def test_a_target_among_others_is_likelier_than_an_echo(board):
     axes = slice(3) if board else slice(4)
     d2 = (((z[1] - z[[0, 2]]) / blurred) ** 2)[:, axes].sum(axis=1)
     of_targets = np.exp(-d2 / 2).sum() / (np.sqrt(2 * np.pi) * blurred)[axes].prod()
-    of_echo = (special.erf(pull / std / np.sqrt(2)) / (2 * pull))[axes].prod()
+    of_echo = (special.erf(pull / std / np.sqrt(2)) / (2 * pull))[axes].prod() * as_strong(tracks)
     flat = np.sqrt(6 / np.pi) if board else 1.0  # a normal's peak over a flat density as wide
     anywhere = 1 / (tracks.range.max() * leeway.ambiguity.period * 2 * (1 if board else 2))
     expected = (flat * of_targets + anywhere) / (0.3 * of_echo)
@@ -382,12 +429,28 @@ def test_what_others_report_is_a_target(spread):
     alone = suspicion(tracks, OWN, Walls(wall()), leeway, asked=none).ratio[1]
     std, pull = np.hypot(1.5 * tracks.std[0], tracks.std[1]), leeway.resolution / 2
     blurred = np.sqrt(reported(image).std[0] ** 2 + tracks.std[1] ** 2 + pull**2 / 3)
-    of_echo = (special.erf(pull / std / np.sqrt(2)) / (2 * pull)).prod()
+    of_echo = (special.erf(pull / std / np.sqrt(2)) / (2 * pull)).prod() * as_strong(tracks)
     more = 1 / (np.sqrt(2 * np.pi) * blurred).prod() / (0.3 * of_echo)
     assert ratio(image) - alone == pytest.approx(more, rel=0.02)
     assert ratio(image + np.array([0.0, 3.0, 0.0])) == pytest.approx(alone, rel=0.02)
     wide = suspicion(tracks, OWN, Walls(wall()), leeway, reported(body, 3.0), none).ratio[1]
     assert wide == pytest.approx(alone, rel=1e-9)
+
+
+def test_a_doubtful_track_explains_as_far_as_it_exists():
+    """The body's track is not reported yet: its image is the likelier an echo, the more probably
+    the body's track follows one; below a fifth it explains nothing. Planted bugs: confirmed ones
+    alone; each alike."""
+    body = replace(track(3, BODY[:3], BODY[3:]), confirmed=False)
+    tracks = track_set([body, track(5, image_of(BODY[:3]), BODY[3:] * TURNED)], OWN)
+    leeway, none = Leeway(RESOLUTION, Ambiguity(PERIOD)), np.zeros(2, bool)
+
+    def ratio(exists: float) -> float:
+        exist = np.array([exists, 1.0])
+        return float(suspicion(tracks, OWN, Walls(wall()), leeway, None, none, exist).ratio[1])
+
+    assert ratio(0.4) == pytest.approx(ratio(0.8) * 2, rel=1e-9)
+    assert np.isinf(ratio(0.19))
 
 
 def test_images_of_a_formation_are_no_targets():
@@ -414,34 +477,6 @@ def test_the_likeliest_source_counts():
         some = track_set([tracks[k] for k in order], OWN)
         leeway = Leeway(RESOLUTION, Ambiguity(PERIOD))
         assert suspicion(some, OWN, Walls(wall()), leeway).source[2] == 4
-
-
-def test_one_detection_has_no_other_wave_in_itself():
-    """Of a strong detection alone, with both directions or one, and of two waves in a cell a
-    resolution apart, or apart by the array's period. Planted bugs: without a direction it is its
-    own other wave; directions not folded."""
-    leeway = Leeway(RESOLUTION, Ambiguity(PERIOD), 1.1)
-    for directions, said in (
-        ([[0.1, 0.2]], [True]),
-        ([[0.1, np.nan]], [True]),
-        ([[0.1, 0.2], [0.1, -0.1]], [False, False]),
-        ([[0.55, 0.2], [-0.54, 0.2]], [True, True]),
-    ):
-        count = len(directions)
-        d = Detections(
-            range=np.full(count, 30.0),
-            velocity=np.zeros(count),
-            direction=np.array(directions),
-            snr=np.full(count, 50.0),
-            std=np.full((count, 4), 0.01),
-            is_reference=np.zeros(count, bool),
-            starts=np.ones(count, bool),
-        )
-        assert alone(d, leeway).tolist() == said
-    paths = np.zeros((4, 4))
-    paths[:, 2] = 0.55
-    paths[3, 2] = -0.54
-    assert not leeway.apart(paths).any()
 
 
 def followed(tracker: Tracker, ghosts: Ghosts, reports: Sequence[Gaussian]) -> bool:
@@ -478,19 +513,18 @@ def test_an_echo_is_doubted_once_its_body_is_known():
 
 @pytest.mark.parametrize(
     ("depth", "std", "frame"),
-    [(0.6, 0.05, 2), (0.6, 0.3, None), (-0.6, 0.05, None), (3.5, 0.05, None)],
+    [(0.6, 0.05, 2), (0.6, 0.3, None), (-0.6, 0.05, None), (3.5, 0.05, 2)],
 )
 def test_a_track_that_goes_behind_a_wall_is_doubted(depth, std, frame):
     """Its place is known well enough only after it was reported. What lies before the wall, or
-    perhaps, stays; so does what is far behind, which never came by. Planted bugs: only new tracks
-    asked; deviations left out; it ends at once."""
+    perhaps, stays. Planted bugs: only new tracks asked; deviations left out; it ends at once."""
     w = Waveform()
     antennas = Antennas(tx_x=2, tx_z=2, rx_x=8, rx_z=8, spacing=0.5774 * w.wavelength)
     ghosts, tracker = (
         Ghosts(Walls(wall()), Leeway.of(w, antennas, 2)),
         Tracker(Tracking(), Ambiguity(PERIOD)),
     )
-    one = track(5, np.array([WALL_X + depth, 24.0, 5.0]), np.zeros(3))
+    one = track(5, np.array([WALL_X + depth, 24.0, 5.0]), np.array([0.0, 9.0, 0.0]))
     one.state = Gaussian(one.state.mean, np.diag([std**2] * 3 + [1e-2] * 3))
     one.odds, one.age, one.hits = existence.SURE, 20, 20
     tracker.state.tracks = [one]
