@@ -213,7 +213,8 @@ def buildings(
         (parts if _says(own, "building:part") else found).append(outline)
     if left:
         counted = ", ".join(f"{count} {why}" for why, count in left.most_common(8))
-        rest = "" if len(left) <= 8 else f", {sum(left.values()) - _most(left)} others"
+        more = left.total() - sum(count for _, count in left.most_common(8))
+        rest = f", {more} others" if more else ""
         notes.append(f"left out as no buildings: {counted}{rest}")
     if not found and not parts:
         said = notes[-1] if left else "it holds nothing"
@@ -234,10 +235,6 @@ def _likely_height(tags: Sequence[Tags]) -> str | None:
                 found[str(name)] += bool(parse_length(value))
     best, count = found.most_common(1)[0] if found else ("", 0)
     return best[:60] if 2 * count > len(tags) else None
-
-
-def _most(left: Counter[str]) -> int:
-    return sum(count for _, count in left.most_common(8))
 
 
 def _no_building(feature: Feature, tags: Tags, city: settings.City, mapped: bool) -> str | None:

@@ -63,16 +63,12 @@ def polygons_of(geometry: shapely.Geometry, what: str) -> list[shapely.Polygon]:
                 f"{what}: the polygon is not valid ({why}) and repair leaves no area; redraw or "
                 "remove it"
             )
-    parts = [geometry] if geometry.geom_type == "Polygon" else shapely.get_parts(geometry).tolist()
+    parts = shapely.get_parts(geometry)
     flat = [p for p in parts if p.geom_type in ("Polygon", "MultiPolygon")]
-    polygons = [q for p in flat for q in _simple(p) if q.area > 0]
+    polygons = [q for p in flat for q in shapely.get_parts(p) if q.area > 0]
     if not polygons:
         raise CityError(f"{what}: the polygon has no area; redraw or remove it")
     return [shapely.remove_repeated_points(shapely.force_2d(p)) for p in polygons]
-
-
-def _simple(part: shapely.Polygon | shapely.MultiPolygon) -> list[shapely.Polygon]:
-    return [part] if part.geom_type == "Polygon" else shapely.get_parts(part).tolist()
 
 
 def _cap(polygon: shapely.Polygon, plan: NDArray[np.float64]) -> NDArray[np.int64]:

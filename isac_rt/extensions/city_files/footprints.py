@@ -159,16 +159,13 @@ def _ground(
     if relief:
         return of_relief(relief)
     _, feet = feet_of(model.solids)
-    centres = [(*shapely.get_coordinates(o.shape.centroid)[0], o.foot) for o in _grounded(model)]
+    grounded = [outline for outline in model.outlines if outline.foot is not None]
+    centres = [(*shapely.get_coordinates(o.shape.centroid)[0], o.foot) for o in grounded]
     feet = np.concatenate([feet, np.array(centres, dtype=np.float64).reshape(-1, 3)])
     if len(feet):
         return ground_through(plan, feet, notes)
     lowest = min((float(solid.vertices[:, 2].min()) for solid in model.solids), default=0.0)
     return flat(plan, lowest if model.solids else -geo.origin[2])
-
-
-def _grounded(model: CityModel) -> list[Outline]:
-    return [outline for outline in model.outlines if outline.foot is not None]
 
 
 def _extruded(
