@@ -325,6 +325,31 @@ def test_what_a_board_makes_of_two_waves_is_their_echo():
     assert order(grid[power.argmin()]) == 0
 
 
+@pytest.mark.parametrize("u", [(0.15, -0.1), (0.1, 0.35)])
+def test_what_two_waves_may_be_besides(u):
+    """The likelihoods of the echo over the ground on one way where the array sees it, too weak to
+    tell by its power, by hand: targets are measured as ever, and spread over the directions as
+    they are, whatever the array makes of two waves. Planted bug: targets as wide as the echo."""
+    body, board = track(3, LEVEL[:3], LEVEL[3:]), square()
+    seen = replace(seen_at(np.array(u)), snr=1e-4)
+    tracks = track_set([body, seen], OWN)
+    here, below = OWN.position - ORIGIN, np.array([1, 1, -1])
+    ends = [(p - here) / np.linalg.norm(p - here) for p in (LEVEL[:3], LEVEL[:3] * below)]
+    beam = board.waves(np.array(u), np.array([[e[[0, 2]] for e in ends]]))[1][0]
+    found = suspicion(tracks, OWN, Walls(GROUND), board, asked=np.zeros(2, bool))
+    assert found.order[1] == 1
+    pull, state = RESOLUTION / 2, body.state.mean[:6] - np.append(OWN.position, OWN.velocity)
+    shown = echoes(state, OWN, Walls(GROUND))
+    std = np.maximum(tracks.std[0], 1.5 * shown.std(body.state.covariance[:6, :6])[0])
+    std = np.hypot(std, tracks.std[1])
+    of_echo = (special.erf(pull / std / np.sqrt(2)) / (2 * pull))[:2].prod() / (2 * beam) ** 2
+    blurred = np.sqrt(np.array([3, 1, 0.1, 0.1]) ** 2 + tracks.std[1] ** 2 + pull**2 / 3)
+    d2 = (((tracks.measured[1] - tracks.measured[0]) / blurred) ** 2).sum()
+    of_target = np.exp(-d2 / 2) / (np.sqrt(2 * np.pi) * blurred).prod()
+    of_target += 1 / (tracks.range.max() * PERIOD * 4)
+    assert found.ratio[1] == pytest.approx(of_target / (0.3 * of_echo), rel=0.02)
+
+
 @pytest.mark.parametrize("spacing", [0.5, 0.8])
 @pytest.mark.parametrize("end", [(0.52, 0.41), (0.14, -0.26)])
 def test_detections_are_somewhere(spacing, end):

@@ -135,12 +135,17 @@ def test_a_corner_that_ends_beside_sends_back(side, corner):
     assert np.isclose(found, np.hypot(9.6, 10.2)).any() == corner
 
 
-@pytest.mark.parametrize(("top", "hidden"), [(4.4, False), (4.6, True)])
+@pytest.mark.parametrize(("over", "hidden"), [(0.2, False), (0.4, True)])
 @pytest.mark.parametrize("deep", [0.0, 0.3])
-def test_waves_bend_round_an_edge(top, deep, hidden):
-    """A screen, and a house, half way to the wall whose edge is 0.2 or 0.4 m over the way: round by
-    0.3 m leads past the one. Planted bugs: straight ways alone; another edge for each face."""
-    at = [[6.0 + d, y, z] for d in (0.0, deep) for y, z in ((-9, 0), (3, 0), (3, top), (-9, top))]
+@pytest.mark.parametrize("slope", np.radians([0, 30, 45, 90]))
+def test_waves_bend_round_an_edge(over, hidden, deep, slope):
+    """A screen, and a house, half way to the wall whose edge of any slope is 0.2 or 0.4 m beside
+    the way: round by 0.3 m leads past the one. Planted bugs: straight ways alone; ways round some
+    edges alone."""
+    along, off = np.array([[np.cos(slope), np.sin(slope)], [-np.sin(slope), np.cos(slope)]])
+    sides = ((-9, -5), (6, -5), (6, over), (-9, over))
+    flat = [np.array([-3.1, 4.2]) + s * along + t * off for s, t in sides]
+    at = [[6.0 + d, *yz] for d in (0.0, deep) for yz in flat]
     walls = city(WALL, at[:4], *([at[4:]] if deep else []))
     line = np.array([[1.7, -3.1, 4.2], [11.3, -3.1, 4.2], [1.7, -3.1, 4.2]]) + ORIGIN
     assert walls.block(line) and walls.block(line, 0.3) == hidden
