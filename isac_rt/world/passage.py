@@ -51,7 +51,7 @@ def beside(city: CityMesh, polyline: np.ndarray, faces: np.ndarray | slice) -> n
     (low, high), least, most = city.boxes, polyline.min(axis=0), polyline.max(axis=0)
     low, high = low[faces], high[faces]
     inside = (low[:, 0] <= most[0]) & (high[:, 0] >= least[0])
-    some = np.flatnonzero(inside)  # few: less than half of the time in a large city
+    some = np.flatnonzero(inside)  # few in a large city: one axis first
     inside[some] = ((low[some] <= most) & (high[some] >= least)).all(axis=1)
     return inside
 

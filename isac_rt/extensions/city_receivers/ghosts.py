@@ -157,8 +157,8 @@ class Suspicion:
         passive terminal the second wall may be another; `mirrored` is the first
     behind : (K,) int32 face that hides the place of the track from the terminal or, at a passive
         one, from its transmitter, -1: it is in sight
-    ratio : (K,) density of targets there over that of the echo's measures, if the frame shows it
-        (`SHOWN`), 0 behind a face; inf: nothing speaks against a target
+    ratio : (K,) density of targets there over that of the echo's measures, if its source exists,
+        the frame shows it (`SHOWN`) and it is as strong, 0 behind a face; inf: none is known
     """
 
     mirrored: np.ndarray

@@ -31,8 +31,8 @@ WELL_INSIDE = 0.95
 ALIAS_DEVIATIONS = 3.0
 """So many deviations further inside at a passive terminal, whose array is half as long."""
 CORNER_STEPS_M = 0.02, 2 * EDGE
-"""From the edge of a corner on each plane [m]: a roof's wall may end a hand above it, and planes
-need not meet."""
+"""From the edge of a corner on each plane [m], or beside by half of it: a roof's wall may end a
+hand above it, and planes need not meet."""
 
 
 class Images(TrackRule):

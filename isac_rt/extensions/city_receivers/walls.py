@@ -150,7 +150,7 @@ class Walls:
         faces, share = hits(self.city.corners[near], *ends)
         return near[faces[(share > 0) & (share < 1)]]
 
-    def block(self, polyline: np.ndarray, edge: float = 0.0) -> bool:
+    def block(self, polyline: np.ndarray, edge: float) -> bool:
         """Return whether faces cross a segment of a polyline (P, 3), but for its ends, and no way
         leads round them by `edge` [m]: waves bend round what shows a part of their Fresnel zone."""
         lines = np.diff(polyline, axis=0)
@@ -165,8 +165,8 @@ class Walls:
         box = np.array([np.minimum(start, end) - edge, np.maximum(start, end) + edge])
         corners = self.city.corners[beside(self.city, box, slice(None))]
         faces, share = hits(corners, start, end)
-        if not faces.size or not edge:
-            return faces.size > 0
+        if not faces.size:
+            return False
         middle = start + share.mean() * (end - start)
         across = np.linalg.svd((end - start)[None])[2][1:]
         turns = 2 * np.pi * np.arange(8)[:, None] / 8  # edges have any slope

@@ -148,7 +148,7 @@ def test_waves_bend_round_an_edge(over, hidden, deep, slope):
     at = [[6.0 + d, *yz] for d in (0.0, deep) for yz in flat]
     walls = city(WALL, at[:4], *([at[4:]] if deep else []))
     line = np.array([[1.7, -3.1, 4.2], [11.3, -3.1, 4.2], [1.7, -3.1, 4.2]]) + ORIGIN
-    assert walls.block(line) and walls.block(line, 0.3) == hidden
+    assert walls.block(line, 0.0) and walls.block(line, 0.3) == hidden
 
 
 @pytest.mark.parametrize(("before", "hidden"), [(0.2, False), (0.4, True)])
