@@ -89,8 +89,10 @@ class StaticClutter(TrackRule):
 
     def prune(self, tracker: Tracker, own: Ownship) -> None:
         """End the tracks in a face or static within a crowd, and those, not reported before, that
-        an echo of one carries on: from beyond the view and along a wall they seem to move. Few hits
-        confirm none beside a surface, whose spots carry it on, nor before the clutter is known."""
+        an echo of one carries on: from beyond the view and along a wall they seem to move. Doubt
+        reported ones that it carries on with gaps: where a wall mirrors the transmitter moves as
+        both ends do. Few hits confirm none beside a surface, whose spots carry it on, nor before
+        the clutter is known."""
         for track in (t for t in tracker.tracks if t.id in own.tentative):
             if track.confirmed and sum(track.recent) < tracker.settings.confirm_window:
                 track.confirmed = int(self._beside(track.state.mean[None, :3]).sum()) < SURFACE
@@ -98,6 +100,8 @@ class StaticClutter(TrackRule):
         fed = {t.id for t in tracker.tracks if t.detection >= 0 and self._crowd[t.detection]}
         still = {t.id for t in tracker.tracks if self.holds(t)}
         tracker.drop(still | (fed & own.tentative))
+        gaps = {t.id for t in tracker.tracks if not all(t.recent)}
+        tracker.doubt(dict.fromkeys(fed & gaps, 1.0))  # a surface shows it as well as a UAV
 
     def update(
         self, d: Detections, own: Pose, time: float, sender: np.ndarray | None = None
