@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -167,3 +170,44 @@ def test_shadow_rays_meet_the_faces_that_sionnas_do():
     assert "solved" not in vars(made)
     assert 400 < clear.sum() < 3600
     assert (clear == LosTest(made.solved.scene.mi_scene).clear(starts, ends)).all()
+
+
+GUARDED = """
+import ctypes, mmap
+import numpy as np
+from isac_rt.runtime import activate
+activate()
+from isac_rt.propagation.segments.rays import LosTest
+from isac_rt.world.city.mesh import CityMesh
+from isac_rt.world.city.scene import CityScenes
+
+libc, page, kept = ctypes.CDLL(None), mmap.PAGESIZE, []
+libc.mprotect.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
+
+def padded(values, width):
+    'In memory that ends with a page; the next one must not be read.'
+    size = len(values) + sum(width)
+    pages = -(-size * values.itemsize // page)
+    kept.append(mmap.mmap(-1, (pages + 1) * page))
+    start = ctypes.addressof(ctypes.c_char.from_buffer(kept[-1]))
+    assert libc.mprotect(start + pages * page, page, 0) == 0
+    out = np.frombuffer(kept[-1], values.dtype, size, pages * page - size * values.itemsize)
+    out[: len(values)] = values
+    return out
+
+corners = np.array([[-2.0, 0, 0], [2, 0, 0], [2, 0, 5], [-2, 0, 5]])
+faces, material = np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.zeros(2, np.int16)
+wall = CityMesh("wall", corners, faces, material, ("brick",), np.zeros(3))
+np.pad = padded
+test = LosTest(CityScenes(wall, 77e9).faces)
+ends = np.array([[0.0, -9.0, 2.0], [0.0, 9.0, 2.0], [0.0, -8.0, 9.0]])
+up = np.tile([0.0, 0.0, 1.0], (3, 1))
+print(test.sees(ends[0], ends, up), test.all_seen(ends[:1], ends, up)[0])
+"""
+
+
+def test_nothing_is_read_behind_an_array_that_ends_with_a_page():
+    """Meshes and rays in arrays of our own, in a process of its own, for a read beyond them ends
+    it. Planted bug: no room behind them."""
+    done = subprocess.run([sys.executable, "-c", GUARDED], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "[ True False  True] [ True False  True]\n")

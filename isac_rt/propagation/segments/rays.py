@@ -13,15 +13,17 @@ import mitsuba as mi
 import numpy as np
 
 from isac_rt.propagation.segments.geometry import RAY_OFFSET_M
+from isac_rt.world.city.scene import with_room
 
 CHUNK = 1 << 20
 
 
 def rays(starts: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> mi.Ray3f:
     """Rays from points (N, 3) along unit vectors (N, 3), as far as `reach` (N,) [m]."""
-    origin, towards = (np.ascontiguousarray(v.T, np.float32) for v in (starts, directions))
-    ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*towards))
-    ray.maxt = mi.Float(reach.astype(np.float32))  # type: ignore[assignment]  # stub: scalars
+    columns = np.column_stack([starts, directions, reach]).T.astype(np.float32)
+    *ends, most = (mi.Float(with_room(column)) for column in columns)
+    ray = mi.Ray3f(mi.Point3f(*ends[:3]), mi.Vector3f(*ends[3:]))
+    ray.maxt = most  # type: ignore[assignment]  # stub: scalars
     return ray
 
 
@@ -34,7 +36,7 @@ def computed(value: Any) -> np.ndarray:
 
 def _columns(*rows: np.ndarray) -> list[mi.Float64]:
     """Every column of some arrays (N, 3) as a variable of the back end."""
-    return [mi.Float64(np.ascontiguousarray(axis)) for part in rows for axis in part.T]
+    return [mi.Float64(with_room(axis)) for part in rows for axis in part.T]
 
 
 class Triangles:

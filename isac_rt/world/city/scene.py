@@ -27,6 +27,13 @@ if TYPE_CHECKING:
 NO_FACE = -1
 
 
+def with_room(values: NDArray) -> NDArray:
+    """Return values (N,) in memory that goes on behind them: Embree, and Dr.Jit on processors, read
+    arrays where they lie, up to 16 numbers at once. Where one ended with a page, the program would
+    end too."""
+    return np.pad(values, (0, 16))[: len(values)]
+
+
 @dataclass(frozen=True)
 class SceneHandle:
     """A scene and the way back from its hits.
@@ -126,8 +133,8 @@ def _shape(city: CityMesh, chosen: NDArray[np.int64], name: str) -> mi.Mesh:
     used, faces = np.unique(city.faces[chosen], return_inverse=True)
     mesh = mi.Mesh(name, used.size, chosen.size)
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = city.vertices[used].astype(np.float32).ravel()
-    parameters["faces"] = faces.astype(np.uint32).ravel()
+    parameters["vertex_positions"] = with_room(city.vertices[used].astype(np.float32).ravel())
+    parameters["faces"] = with_room(faces.astype(np.uint32).ravel())
     parameters.update()
     return mesh
 
