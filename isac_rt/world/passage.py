@@ -67,9 +67,8 @@ def _first(city: CityMesh, faces: np.ndarray, polyline: np.ndarray, begin: int) 
             return None
         return Passage(begin, float(share.min()), int(faces[hit[share.argmin()]]))
     half = len(polyline) // 2
-    return _first(city, faces, polyline[: half + 1], begin) or _first(
-        city, faces, polyline[half:], begin + half
-    )
+    parts = polyline[: half + 1], polyline[half:]
+    return _first(city, faces, parts[0], begin) or _first(city, faces, parts[1], begin + half)
 
 
 def hits(corners: np.ndarray, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

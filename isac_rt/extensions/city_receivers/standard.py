@@ -29,9 +29,8 @@ def equipment_of(setup: Setup, link: Link, s: ReceiverSet | Scenario) -> Equipme
             Ghosts(walls, Leeway.of(waveform, antennas, passes)),
             StaticClutter.of(antennas, waveform, passes, walls),
         ]
-    hardware = HardwareModel()
-    if s.receivers.self_calibration != "none":
-        hardware = LearnedHardware(waveform, antennas, passes)
+    learns = s.receivers.self_calibration != "none"
+    hardware = LearnedHardware(waveform, antennas, passes) if learns else HardwareModel()
     if link.own:
         return Equipment(rules, hardware)
     other_paths = OtherPaths()

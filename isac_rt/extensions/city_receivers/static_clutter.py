@@ -90,9 +90,8 @@ class StaticClutter(TrackRule):
     def prune(self, tracker: Tracker, own: Ownship) -> None:
         """End the tracks in a face or static within a crowd, and those, not reported before, that
         an echo of one carries on: from beyond the view and along a wall they seem to move. Doubt
-        reported ones that it carries on with gaps: where a wall mirrors the transmitter moves as
-        both ends do. Few hits confirm none beside a surface, whose spots carry it on, nor before
-        the clutter is known."""
+        reported ones that it carries on with gaps: what a wall mirrors moves too. Few hits confirm
+        none beside a surface, whose spots carry it on, nor before the clutter is known."""
         for track in (t for t in tracker.tracks if t.id in own.tentative):
             if track.confirmed and sum(track.recent) < tracker.settings.confirm_window:
                 track.confirmed = int(self._beside(track.state.mean[None, :3]).sum()) < SURFACE
@@ -193,10 +192,8 @@ class StaticClutter(TrackRule):
 def rests(track: Track) -> bool:
     """Return whether a track is static, by the odds of its velocity."""
     velocity, P = track.state.mean[3:6], track.state.covariance[3:6, 3:6]
-    d2, log_det = mahalanobis(
-        np.tile(velocity, (2, 1)),
-        P + np.square([np.full(3, STILL_MPS), INITIAL_SPEED_STD])[:, None] * np.eye(3),
-    )
+    spread = np.square([np.full(3, STILL_MPS), INITIAL_SPEED_STD])[:, None] * np.eye(3)
+    d2, log_det = mahalanobis(np.tile(velocity, (2, 1)), P + spread)
     still, flies = -(d2 + log_det) / 2
     return bool(still - flies > np.log(STANDS_ODDS))
 

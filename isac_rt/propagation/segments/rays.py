@@ -151,10 +151,8 @@ def _ray(position: list[mi.Float64], facet: list[mi.Float64]) -> mi.Ray3f:
     dx, dy, dz = x - sx, y - sy, z - sz
     length = dr.sqrt(dx * dx + dy * dy + dz * dz)
     size = dr.maximum(length, RAY_OFFSET_M)
-    ray = mi.Ray3f(
-        mi.Point3f(mi.Float(sx), mi.Float(sy), mi.Float(sz)),
-        mi.Vector3f(mi.Float(dx / size), mi.Float(dy / size), mi.Float(dz / size)),
-    )
+    start = mi.Point3f(mi.Float(sx), mi.Float(sy), mi.Float(sz))
+    ray = mi.Ray3f(start, mi.Vector3f(*(mi.Float(d / size) for d in (dx, dy, dz))))
     reach = mi.Float(dr.maximum(length - RAY_OFFSET_M, 0.0))
     ray.maxt = reach  # type: ignore[assignment]  # stub: scalars
     return ray

@@ -28,9 +28,8 @@ NO_FACE = -1
 
 
 def with_room(values: NDArray) -> NDArray:
-    """Return values (N,) in memory that goes on behind them: Embree, and Dr.Jit on processors, read
-    arrays where they lie, up to 16 numbers at once. Where one ended with a page, the program would
-    end too."""
+    """Return values (N,) with room behind them: Embree, and Dr.Jit on processors, read arrays where
+    they lie, up to 16 numbers at once, and reading past the end of memory ends the program."""
     return np.pad(values, (0, 16))[: len(values)]
 
 
@@ -108,13 +107,8 @@ def build_scene(city: CityMesh, carrier_frequency: float) -> SceneHandle:
     shapes, faces = [], []
     for index, chosen in _by_material(city).items():
         name = f"surface-{index}"
-        shapes.append(
-            rt.SceneObject(
-                mi_mesh=_shape(city, chosen, name),
-                name=name,
-                radio_material=_radio(city.materials[index], name),
-            )
-        )
+        mesh, radio = _shape(city, chosen, name), _radio(city.materials[index], name)
+        shapes.append(rt.SceneObject(mi_mesh=mesh, name=name, radio_material=radio))
         faces.append(chosen)
     if shapes:
         scene.edit(add=shapes)
