@@ -135,6 +135,23 @@ def test_what_a_link_saw_last_counts_until_it_receives_again():
         assert r.false == 0
 
 
+def test_a_track_follows_whom_it_followed_while_it_is_near():
+    """U2 0.3 m beside U1, both tracked; then U1's track is missing, and another is 1.2 m from U2 on
+    its ellipse about AT and PT, too far out for U1. Whoever looks at that frame alone takes U2's
+    track for U1's and the other for U2's. Planted bugs: nothing is remembered; it is kept however
+    far off."""
+    held, poses = scorer(), {n: Pose.at_rest(p) for n, (_, p) in PLACES.items()}
+    poses["U2"] = Pose.at_rest((10.3, 30, 50))
+
+    def follows(*bodies):
+        view = {SWARM: View(0.1, bodies)}
+        return held.record(0, view, observers(), {SWARM: poses})[SWARM].uav.tolist()
+
+    assert follows(body(1, (10, 30, 50)), body(2, (10.3, 30, 50))) == [2, 3]
+    assert follows(body(2, (10.3, 30, 50)), body(3, (10.3, 31.2, 50))) == [3, -1]
+    assert follows(body(2, (40, 30, 50)), body(3, (10.3, 30, 50))) == [-1, 3]
+
+
 def test_figures_of_a_run_by_hand():
     """Three frames, U1 and U2 in view: both found and tracked, U1 alone found and tracked under
     another name, none. Errors 0.2 and 0.3 m, then 0.6 m upwards."""
