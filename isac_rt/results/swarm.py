@@ -80,11 +80,11 @@ class View:
 
 @dataclass
 class Remembered:
-    """UAVs (U,) that links saw and found when they last received; tracks that followed UAVs."""
+    """UAVs (U,) that links last saw and found; whom each set's tracks followed a frame ago."""
 
     seen: dict[Link, np.ndarray] = field(default_factory=dict)
     found: dict[Link, np.ndarray] = field(default_factory=dict)
-    followed: dict[str, dict[int, Name]] = field(default_factory=dict)
+    followed: dict[str, dict[Name, int]] = field(default_factory=dict)
 
 
 class SwarmScorer(Stateful):
@@ -142,14 +142,14 @@ class SwarmScorer(Stateful):
         off = self._off(mean[rows], seen_by, poses)
         follows = np.full(len(tracks), -1)
         error = np.full((len(names), len(ERRORS)), np.nan)
-        followed = self.state.followed.setdefault(name, {})
-        at = {tracks[row].name: k for k, row in enumerate(rows)}
-        for k, u in [(at[name], u) for u, name in followed.items() if name in at]:
-            if off[k, u] < GATE_RESOLUTIONS:  # still: the miss of one shifts no others
+        followed = self.state.followed.get(name, {})
+        for k, row in enumerate(rows):  # the miss of one shifts no others
+            if (u := followed.get(tracks[row].name, -1)) >= 0 and off[k, u] < GATE_RESOLUTIONS:
                 off[k], off[:, u], off[k, u] = np.inf, np.inf, 0.0
-        for k, u in assigned(off, GATE_RESOLUTIONS):
-            follows[rows[k]], followed[u] = u, tracks[rows[k]].name
-            error[u] = _errors(tracks[rows[k]], truth[u])
+        pairs = [(rows[k], u) for k, u in assigned(off, GATE_RESOLUTIONS)]
+        self.state.followed[name] = {tracks[k].name: u for k, u in pairs}
+        for k, u in pairs:
+            follows[k], error[u] = u, _errors(tracks[k], truth[u])
         return FusedRecord(
             gospa=np.array(distance[1:]),
             seen=seen,

@@ -20,8 +20,8 @@ CHUNK = 1 << 20
 
 def rays(starts: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> mi.Ray3f:
     """Rays from points (N, 3) along unit vectors (N, 3), as far as `reach` (N,) [m]."""
-    columns = np.column_stack([starts, directions, reach]).T.astype(np.float32)
-    *ends, most = (mi.Float(with_room(column)) for column in columns)
+    columns = *starts.T, *directions.T, reach
+    *ends, most = (mi.Float(with_room(column.astype(np.float32))) for column in columns)
     ray = mi.Ray3f(mi.Point3f(*ends[:3]), mi.Vector3f(*ends[3:]))
     ray.maxt = most  # type: ignore[assignment]  # stub: scalars
     return ray

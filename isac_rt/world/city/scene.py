@@ -28,8 +28,8 @@ NO_FACE = -1
 
 
 def with_room(values: NDArray) -> NDArray:
-    """Return values (N,) with room behind them: Embree, and Dr.Jit on processors, read arrays where
-    they lie, up to 16 numbers at once, and reading past the end of memory ends the program."""
+    """Return values (N,) with room behind them: Embree, and Dr.Jit on CPUs, read arrays where they
+    lie, up to 16 numbers at once, and reading past the end of memory ends the program."""
     return np.pad(values, (0, 16))[: len(values)]
 
 

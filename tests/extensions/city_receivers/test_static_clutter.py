@@ -264,14 +264,13 @@ def test_a_young_track_that_an_echo_of_a_crowd_carries_on_is_none():
     one with gaps is doubted, for a tenth of the frames show an artefact. Planted bugs: all of the
     crowd go; only what is confirmed goes; all are doubted; what another echo carries on is."""
 
-    def track(number: int, detection: int, confirmed: bool = True, *gap: bool) -> Track:
-        mean, flies = np.zeros(9), np.array([0.0, 0.0, 0.0, 9.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-        g, found = Gaussian(mean + flies, np.eye(9)), [*gap, True]
-        odds = {"odds": 3.0, "recent": found}
-        return Track(number, g, 9.0, confirmed=confirmed, detection=detection, **odds)
+    def track(number: int, detection: int, confirmed: bool = True, gap: bool = False) -> Track:
+        flies = Gaussian(np.array([0.0, 0.0, 0.0, 9.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.eye(9))
+        of = {"recent": [True, not gap, True], "odds": 3.0, "detection": detection}
+        return Track(number, flies, 9.0, confirmed=confirmed, **of)
 
-    tracks = [track(1, 0), track(2, 0), track(3, 1), track(4, 0, False), track(5, -1)]
-    tracks += [track(6, 0, True, True, False), track(7, 1, True, False)]
+    tracks = [track(1, 0), track(2, 0), track(3, 1), track(4, 0, confirmed=False), track(5, -1)]
+    tracks += [track(6, 0, gap=True), track(7, 1, gap=True)]
     tracker = Tracker(Tracking(), UNAMBIGUOUS)
     tracker.state.tracks = tracks
     static_clutter = StaticClutter(1.71, None, PERIOD)
